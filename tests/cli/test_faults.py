@@ -14,15 +14,13 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+from tests.cli.commands import run
 from tests.helpers import ROOT, start_interruptible
 from tests.video.clips import gray_frames, write_clip
-from vehicle_detection import detector, events, export, report
+from vehicle_detection import detector, events, export, report, video
 from vehicle_detection._common import files
 from vehicle_detection._kernels.jit import jit
-from vehicle_detection.cli import demo
-from vehicle_detection.cli.app import app
 from vehicle_detection.cli.signals import raise_on_signals
 from vehicle_detection.errors import OutputError
 from vehicle_detection.images import write_image
@@ -38,10 +36,6 @@ def clip(tmp_path_factory):
     noise = np.random.default_rng(0).integers(0, 40, (120, 160, 3), dtype=np.uint8)
     frames = [frame + noise for frame in gray_frames(10, width=160, height=120)]
     return write_clip(tmp_path_factory.mktemp("faults") / "clip.mp4", frames)
-
-
-def run(*words):
-    return CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
 
 
 def contents(folder):
@@ -327,21 +321,12 @@ def test_a_demo_names_its_folder_in_errors(tmp_path, monkeypatch):
     def fail(clip, annotated, *_, **__):
         raise OutputError(f"{annotated} cannot be written")
 
-    monkeypatch.setattr(demo, "process_video", fail)
+    monkeypatch.setattr(video, "process_video", fail)
     result = run("demo", "-o", tmp_path, "--frames", 3)
     assert (result.exit_code, result.stderr) == (
         2,
         f"error: {tmp_path / 'annotated.mp4'} cannot be written\n",
     )
-
-
-def test_a_folder_for_images_that_is_read_only(tmp_path, monkeypatch):
-    write_image(tmp_path / "a.png", np.zeros((64, 64, 3), np.uint8))
-    monkeypatch.setattr(os, "access", lambda _, mode: not mode & os.W_OK)
-    result = run("detect", tmp_path / "a.png", "-o", tmp_path / "out")
-    message = f"error: --output needs a writable folder, {tmp_path / 'out'} is read-only; choose another\n"
-    assert (result.exit_code, result.stdout, result.stderr) == (2, "", message)
-    assert contents(tmp_path) == ["a.png"]
 
 
 def test_an_interrupted_batch_leaves_no_empty_folder(clip, tmp_path):
@@ -373,10 +358,6 @@ def test_a_current_folder_that_has_been_removed(clip, tmp_path):
     )
     message = "error: the current folder has been removed; change to another one\n"
     assert (done.returncode, done.stderr) == (2, message)
-
-
-def test_an_output_error_is_an_error_of_the_system():
-    assert issubclass(OutputError, OSError)
 
 
 # --- arguments and environment ---

@@ -3,22 +3,9 @@ import re
 import sys
 
 import pytest
-from typer.testing import CliRunner
 
+from tests.cli.commands import contents, refuse, refuse_each, run
 from tests.helpers import drawn, write_frame_set
-from vehicle_detection.cli.app import app
-
-
-def run(*words):
-    return CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
-
-
-def refuse(*words):
-    """Run a command that must fail with one line on standard error; return the line."""
-    result = run(*words)
-    assert result.exit_code == 2, result.output
-    assert re.fullmatch(r"error: [^\n]+\n", result.stderr), result.stderr
-    return result.stderr
 
 
 @pytest.fixture(scope="module")
@@ -61,21 +48,8 @@ def test_train_continue_and_show(roads, initial, tmp_path, monkeypatch):
     from vehicle_detection.training import fine_tune
 
     own, curves, checkpoint = (tmp_path / name for name in ("own.onnx", "c.csv", "own.onnx.checkpoint"))
-    words = [
-        "train-frames",
-        roads,
-        "-o",
-        own,
-        "--model",
-        initial,
-        "--steps",
-        2,
-        "--jobs",
-        1,
-        "--device",
-        "cpu",
-    ]
-    words += ["--curves", curves]
+    words = ["train-frames", roads, "-o", own, "--model", initial, "--steps", 2]
+    words += ["--jobs", 1, "--device", "cpu", "--curves", curves]
     with monkeypatch.context() as patch:
 
         def interrupt(*arguments, **options):
@@ -101,21 +75,20 @@ def test_train_continue_and_show(roads, initial, tmp_path, monkeypatch):
         assert re.search(line, shown), line
 
 
-def test_bad_input_is_refused_before_the_training(roads, tmp_path):
+def test_bad_input_is_refused_before_the_training(roads, tmp_path, monkeypatch):
     pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
-    own = tmp_path / "own.onnx"
     cases = {
-        r"folder .+none does not exist; pass the folder of the labelled": [tmp_path / "none", "-o", own],
-        r"folder .+empty has no labels/NAME.csv": [tmp_path / "empty", "-o", own],
-        r"--output needs an existing folder": [roads, "-o", tmp_path / "none" / "own.onnx"],
-        r"--output must end in \.onnx": [roads, "-o", tmp_path / "own.safetensors"],
-        r"--curves .+ is also --output .+;": [roads, "-o", own, "--curves", own],
-        r"--seed must be an integer at least 0": [roads, "-o", own, "--seed", -1],
-        r"--steps must be an integer at least 1": [roads, "-o", own, "--steps", 0],
-        r"--device must be one of 'cpu', 'cuda'": [roads, "-o", own, "--device", "tpu"],
-        r"none\.onnx": [roads, "-o", own, "--model", tmp_path / "none.onnx"],
+        "none -o own.onnx": "folder none does not exist; pass the folder of the labelled",
+        "empty -o own.onnx": "folder empty has no labels/NAME.csv",
+        "{roads} -o none/own.onnx": "--output needs an existing folder",
+        "{roads} -o own.safetensors": r"--output must end in \.onnx",
+        "{roads} -o own.onnx --curves own.onnx": "--curves .+ is also --output .+;",
+        "{roads} -o own.onnx --seed -1": "--seed must be an integer at least 0",
+        "{roads} -o own.onnx --steps 0": "--steps must be an integer at least 1",
+        "{roads} -o own.onnx --device tpu": "--device must be one of 'cpu', 'cuda'",
+        "{roads} -o own.onnx --model none.onnx": r"none\.onnx",
     }
-    for message, words in cases.items():
-        assert re.search(message, refuse("train-frames", *words)), message
-    assert not own.exists()
+    refuse_each("train-frames", cases, roads=roads)
+    assert contents(tmp_path) == ["empty"]

@@ -1,10 +1,10 @@
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from vehicle_detection.cli.app import app
+from tests.cli import commands
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.scenes import render_patches, render_scene, write_labels
 from vehicle_detection.training import read_results, trials
@@ -13,15 +13,7 @@ SMALL = "spatial_size=8 hist_bins=8 pix_per_cell=16 hog_channel=0 mirror=no"
 
 
 def run(*words):
-    return CliRunner().invoke(app, ["tune", *map(str, words)], catch_exceptions=False)
-
-
-def refuse(*words):
-    """Run a command that must fail with one line on standard error; return the line."""
-    result = run(*words)
-    assert result.exit_code == 2, result.output
-    assert re.fullmatch(r"error: [^\n]+\n", result.stderr.rpartition("\r")[2]), result.stderr
-    return result.stderr
+    return commands.run("tune", *words)
 
 
 @pytest.fixture(scope="module")
@@ -80,14 +72,8 @@ def test_halving_measures_its_finalists(patches, tmp_path, split):
 
 def test_frames_are_scored(patches, material, tmp_path):
     out = tmp_path / "table.parquet"
-    words = (
-        "--frames",
-        material / "road",
-        "--labels",
-        material / "road.csv",
-        "--cache",
-        tmp_path / "features",
-    )
+    words = ["--frames", material / "road", "--labels", material / "road.csv"]
+    words += ["--cache", tmp_path / "features"]
     result = run(*patches, "--grid", f"orient=3 {SMALL}", "-o", out, *words)
     assert result.exit_code == 0, result.output
     assert re.search(r"frames F1 +best F1", result.stdout)
@@ -113,34 +99,29 @@ def test_an_interrupt_keeps_the_measured_rows(patches, tmp_path, monkeypatch):
     assert list(read_results(tmp_path / "table.csv")["orient"]) == [3]
 
 
-def test_tune_refuses_bad_input(patches, material, tmp_path):
-    table, grid = ("-o", tmp_path / "table.csv"), ("--grid", f"orient=3 {SMALL}")
-    assert "--grid has the unknown option 'color'" in refuse(*patches, *table, "--grid", "color=LAB")
-    assert "--grid must look like 'orient=8,9" in refuse(*patches, *table, "--grid", "orient")
-    assert "--finalists must be an integer at least 1; got 0" in refuse(
-        *patches, *table, *grid, "--halving", "--finalists", 0
-    )
-    assert "--split must be one of 'sequences'" in refuse(*patches, *table, *grid, "--split", "half")
-    assert "--output must end in .csv, .jsonl, .parquet" in refuse(
-        *patches, *grid, "-o", tmp_path / "table.xls"
-    )
-    assert "--output needs an existing folder" in refuse(
-        *patches, *grid, "-o", tmp_path / "none" / "table.csv"
-    )
-    assert "--plot must end in .png, .svg" in refuse(*patches, *grid, *table, "--plot", tmp_path / "plot.jpg")
-    assert "--plot needs an existing folder" in refuse(
-        *patches, *grid, *table, "--plot", tmp_path / "none" / "p.png"
-    )
-    assert "--frames and --labels belong together" in refuse(
-        *patches, *grid, *table, "--frames", material / "road"
-    )
-    missing = ("--vehicles", tmp_path / "missing.zip", *patches[2:])
-    assert "does not exist" in refuse(*missing, *grid, *table)
-    (tmp_path / "table.csv").write_text("a,b\n1,2\n")
-    assert "has other columns than this release writes" in refuse(*patches, *grid, *table)
-    same = ("--vehicles", tmp_path / "table.csv", *patches[2:])
-    assert "is also --vehicles" in refuse(*same, *grid, *table)
-    assert (tmp_path / "table.csv").read_text() == "a,b\n1,2\n"
+def test_tune_refuses_bad_input(patches, material, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("a.csv").write_text("a,b\n1,2\n")
+    cases = {
+        "{patches} -o t.csv --grid color=LAB": "--grid has the unknown option 'color'",
+        "{patches} -o t.csv --grid orient": "--grid must look like 'orient=8,9",
+        "{patches} {grid} -o t.csv --halving --finalists 0": "--finalists must be an integer at least 1",
+        "{patches} {grid} -o t.csv --split half": "--split must be one of 'sequences'",
+        "{patches} {grid} -o t.xls": "--output must end in .csv, .jsonl, .parquet",
+        "{patches} {grid} -o none/t.csv": "--output needs an existing folder",
+        "{patches} {grid} -o t.csv --plot p.jpg": "--plot must end in .png, .svg",
+        "{patches} {grid} -o t.csv --plot none/p.png": "--plot needs an existing folder",
+        "{patches} {grid} -o t.csv --frames {material}/road": "--frames and --labels .*; give both",
+        "{patches} {grid} -o t.csv --horizon 0.5": "--horizon needs --frames",
+        "--vehicles missing.zip {others} {grid} -o t.csv": "missing.zip does not exist",
+        "{patches} {grid} -o a.csv": "has other columns than this release writes",
+        "--vehicles a.csv {others} {grid} -o a.csv": "is also --vehicles",
+    }
+    vehicles, others = (f"{name} {path}" for name, path in (patches[:2], patches[2:]))
+    files = {"patches": f"{vehicles} {others}", "others": others, "material": material}
+    commands.refuse_each("tune", cases, grid=f"--grid 'orient=3 {SMALL}'", **files)
+    assert commands.contents(tmp_path) == ["a.csv"]
+    assert Path("a.csv").read_text() == "a,b\n1,2\n"
 
 
 def test_a_grid_that_cannot_be_trained_is_an_error(material, tmp_path):
@@ -172,7 +153,7 @@ def test_a_single_patch_of_each_class(patches, tmp_path):
         first = min(folder.rglob("*.png"))
         write_image(tmp_path / name / "1.png", read_image(first))
         words += [name, tmp_path / name]
-    message = refuse(*words, "--grid", "orient=3", "-o", tmp_path / "t.csv")
+    message = commands.refuse("tune", *words, "--grid", "orient=3", "-o", tmp_path / "t.csv")
     assert "--vehicles and --non-vehicles must hold a folder of two or more patches; add" in message
 
 

@@ -1,0 +1,61 @@
+"""Run commands in the tests, in this process or as programs."""
+
+import re
+import shlex
+import sys
+
+from typer.testing import CliRunner
+
+from tests.helpers import start_interruptible
+from vehicle_detection.cli.app import app
+
+COMMANDS = ("demo", "detect", "video", "batch", "evaluate", "train", "train-frames", "tune", "fetch", "info")
+HEADER = "frame,track_id,x1,y1,x2,y2,score"
+
+
+def run(*words):
+    """Run a command in this process; errors that it does not handle are raised here."""
+    result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
+    assert "\x1b" not in result.output, "colors without a terminal"
+    return result
+
+
+def succeed(*words):
+    result = run(*words)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def refuse(*words, code=2):
+    """Run a command that must fail with one line on standard error; return the line."""
+    result = run(*words)
+    assert result.exit_code == code, result.output
+    assert re.fullmatch(r"error: [^\n]+\n", result.stderr), result.stderr
+    return result.stderr
+
+
+def start(*words, **options):
+    return start_interruptible(sys.executable, "-m", "vehicle_detection", *words, **options)
+
+
+def finish(process):
+    out, errors = process.communicate(timeout=300)
+    return process.returncode, out, errors
+
+
+def contents(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
+
+
+def patches_of(folder):
+    return ["--vehicles", folder / "vehicles", "--non-vehicles", folder / "non-vehicles"]
+
+
+def refuse_each(command, cases, **files):
+    """Run a command with each of some wrong words; the message must name the argument and the remedy.
+
+    The words are a line, in which ``{name}`` stands for a file.
+    """
+    for line, message in cases.items():
+        error = refuse(command, *shlex.split(line.format(**files)))
+        assert re.search(message, error), (line, error)

@@ -1,0 +1,38 @@
+"""Material that the tests of the commands share."""
+
+import pytest
+
+from vehicle_detection.cli.demo import draw_clip
+from vehicle_detection.images import write_image
+from vehicle_detection.scenes import render_drive, render_patches
+
+
+@pytest.fixture(scope="module")
+def material(tmp_path_factory):
+    """Return a folder with a clip and its labels, a picture, patches and damaged copies."""
+    folder = tmp_path_factory.mktemp("material")
+    drive = render_drive(frames=10, shape=(270, 480), scenario="overtaking")
+    draw_clip(drive, folder / "clip.mp4", folder / "labels.csv")
+    write_image(folder / "road.png", drive[6].image)
+    patches, labels = render_patches(40, random_state=3)
+    for number, (patch, label) in enumerate(zip(patches, labels)):
+        home = folder / ("vehicles" if label else "non-vehicles") / "drawn"
+        home.mkdir(parents=True, exist_ok=True)
+        write_image(home / f"{number}.png", patch)
+    for name in ("clip.mp4", "road.png"):
+        data = (folder / name).read_bytes()
+        (folder / f"cut_{name}").write_bytes(data[: len(data) // 2])
+    for name in ("text.mp4", "text.png", "text.safetensors"):
+        (folder / name).write_text("not what the name says")
+    (folder / "empty").mkdir()
+    return folder
+
+
+@pytest.fixture
+def picture(material):
+    return material / "road.png"
+
+
+@pytest.fixture
+def clip(material):
+    return material / "clip.mp4"

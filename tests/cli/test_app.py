@@ -1,0 +1,234 @@
+import errno
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+
+import vehicle_detection
+from tests.cli.commands import COMMANDS, contents, finish, refuse, refuse_each, run, start, succeed
+from tests.helpers import start_interruptible
+from vehicle_detection import detector
+from vehicle_detection._common import files as _files
+from vehicle_detection.cli.app import app
+from vehicle_detection.cli.demo import draw_clip
+from vehicle_detection.scenes import render_drive
+
+
+def test_help_has_a_short_option():
+    for words in ((), ("video",), ("train",)):
+        assert "Show this message and exit" in succeed(*words, "-h")
+
+
+def test_options_are_listed_in_panels():
+    page = succeed("video", "--help")
+    titles = re.findall(r"^╭─ (\w+) ─", page, re.MULTILINE)
+    assert titles == ["Arguments", "Options", "Output", "Input", "Camera", "Search", "Drawing"]
+    assert re.search(r"--live\s+Drop frames", page), "an option without a value has no type"
+
+
+def test_shells_complete_commands_and_options():
+    words = {"vehicle-detection ev": ["evaluate"], "vehicle-detection video --pa": ["--panel"]}
+    for typed, expected in words.items():
+        variables = {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+        variables["_VEHICLE_DETECTION_COMPLETE"] = "complete_bash"
+        process = start(env={**os.environ, **variables})
+        assert finish(process) == (0, "\n".join(expected) + "\n", "")
+
+
+def test_every_command_has_help_that_loads_no_heavy_library():
+    code = (
+        "import sys, json\n"
+        "from typer.testing import CliRunner\n"
+        "from vehicle_detection.cli.app import app\n"
+        "pages = [[], *([command] for command in sys.argv[1:])]\n"
+        "results = [CliRunner().invoke(app, [*words, '--help']) for words in pages]\n"
+        "roots = sorted({name.split('.')[0] for name in sys.modules})\n"
+        "print(json.dumps([[r.exit_code, r.stdout] for r in results] + [roots]))"
+    )
+    out = subprocess.run([sys.executable, "-c", code, *COMMANDS], capture_output=True, text=True, check=True)
+    assert out.stderr == ""
+    *pages, loaded = json.loads(out.stdout)
+    assert not set(loaded) & {"numpy", "numba", "cv2", "sklearn", "moviepy", "matplotlib", "pandas", "scipy"}
+    assert [code for code, _ in pages] == [0] * len(pages)
+    for command, (_, page) in zip(COMMANDS, pages[1:]):
+        assert command in pages[0][1]
+        assert re.search(rf"Usage: \S+ {command}", page)
+
+
+def test_module_runs_as_a_program(picture, tmp_path):
+    # In parallel, as most of the time is spent on starting.
+    runs = [
+        start("detect", picture, "-o", tmp_path / "out", env={**os.environ, "NO_COLOR": "1"}),
+        start("detect", tmp_path / "missing.png"),
+        start("detect", tmp_path),
+        start("--version"),
+        start("detect", "--nonsense"),
+    ]
+    (found, missing, folder, version, usage) = (finish(process) for process in runs)
+    assert found[0] == 0
+    assert found[2] == ""
+    assert re.match(rf"{re.escape(str(picture))}: \d+ vehicles?( |\n)", found[1])
+    assert contents(tmp_path) == ["out", "out/road.png"]
+    assert missing[:2] == (2, "")
+    assert re.fullmatch(r"error: IMAGE .+missing.png does not exist; check the path\n", missing[2])
+    assert folder[0] == 2
+    assert re.fullmatch(r"error: IMAGE .+ is a folder; choose files in it, such as .+\n", folder[2])
+    assert version == (0, f"{vehicle_detection.__version__}\n", "")
+    assert usage[0] == 2
+    assert "--nonsense" in usage[2]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signal")
+def test_ctrl_c_leaves_nothing_behind(tmp_path, material):
+    long = tmp_path / "long.mp4"
+    draw_clip(render_drive(frames=1, shape=(270, 480), scenario="empty"), long, tmp_path / "labels.csv")
+    slow = (
+        "import time, sys\n"
+        "import vehicle_detection.{module} as module\n"
+        "module.{name} = lambda *a, **k: (print('now', flush=True), time.sleep(600))\n"
+        "sys.argv = ['vehicle-detection', *sys.argv[1:]]\n"
+        "from vehicle_detection.cli import main; main()"
+    )
+    out, patches = tmp_path / "out", (material / "vehicles", material / "non-vehicles")
+    runs = {
+        ("video", "process_video"): ["video", long, "-o", out / "x.mp4", "--tracks", out / "x.csv"],
+        ("cli.demo", "draw_clip"): ["demo", "-o", tmp_path / "demo" / "deep"],
+        ("training", "train_and_evaluate"): [
+            "train", "--vehicles", patches[0], "--non-vehicles", patches[1], "-o", out / "x.safetensors",
+        ],
+    }  # fmt: skip
+    out.mkdir()
+    processes = [
+        start_interruptible(sys.executable, "-c", slow.format(module=module, name=name), *words)
+        for (module, name), words in runs.items()
+    ]
+    for process in processes:
+        assert process.stdout.readline() == "now\n"
+        os.killpg(process.pid, signal.SIGINT)
+        assert finish(process) == (130, "", "interrupted\n")
+    assert contents(out) == []
+    assert not (tmp_path / "demo").exists()
+
+
+def test_an_interrupted_command_leaves_no_file(monkeypatch, picture, tmp_path):
+    def interrupt(self, image):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(detector.VehicleDetector, "detect", interrupt)
+    result = run("detect", picture, "-o", tmp_path / "a" / "b", "--boxes", tmp_path / "boxes.csv")
+    assert (result.exit_code, result.stdout, result.stderr) == (130, "", "interrupted\n")
+    assert contents(tmp_path) == []
+
+
+def test_a_full_disk_is_one_line(monkeypatch, picture, tmp_path):
+    def fill(source, target, *rest, **options):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", fill)
+    assert "No space left" in refuse("detect", picture, "--boxes", tmp_path / "boxes.csv")
+    assert contents(tmp_path) == []
+
+
+def test_unexpected_errors_keep_their_traceback(monkeypatch, picture):
+    def fail(self, image):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(detector.VehicleDetector, "detect", fail)
+    with pytest.raises(RuntimeError, match="a bug"):
+        run("detect", picture)
+
+
+def test_batch_refuses_bad_input(material, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cases = {
+        "": r"SOURCES\.\.\. must name at least one video",
+        "nothing": r"SOURCES\.\.\. nothing does not exist; check the path",
+        "{material}/empty": r"SOURCES\.\.\. .+empty holds no videos",
+        "x --shard 9/3": "--shard must be a number and a count, such as 3/200 .* got '9/3'",
+        "x --group day": "--group must be one of 'trip', 'file'",
+        "x --dry-run --summary s.csv": "--dry-run .* --summary; omit one of them",
+        "--status --summary s.doc": "--summary must end in .csv",
+        "x --model nothing": "model file nothing does not exist",
+        "x --preset quick": "--preset must be one of",
+        "x --every 0": "--every must be an integer",
+        "x --fov 999": "--fov must be a number",
+        "x --blur faces": "--blur must be one of",
+    }
+    refuse_each("batch", {f"-o out {line}": message for line, message in cases.items()}, material=material)
+    refuse_each("batch", {"-o nothing --status": "--output nothing is not a folder; pass"})
+    assert succeed("batch", "-o", tmp_path, "--status").startswith("0 trips done, 0 failed, 0 errors\n")
+
+
+def test_the_help_of_each_option_shows_what_to_write():
+    choices = re.compile(r"[a-z]+(\|[a-z]+)+")  # all values
+    example = re.compile(r'such as \S|"\w+"|\.[a-z]{3,}|\d')
+    types = {None, "TEXT", "INTEGER", "FLOAT", "BOOLEAN", "STR", "INT"}
+    command = typer.main.get_command(app)
+    assert set(command.commands) == set(COMMANDS)
+    for name, each in command.commands.items():
+        for option in each.params:
+            assert option.help.endswith((".", "'")), (name, option.opts)
+            if getattr(option, "is_flag", False):
+                continue
+            words = f"{name} {option.opts[0]} {option.metavar}: {option.help}"
+            assert option.metavar not in types, words
+            given = option.default is not None and not callable(option.default)  # printed by --help
+            shown = given or choices.fullmatch(option.metavar) or "." in option.metavar
+            assert shown or example.search(option.help), words
+
+
+def test_read_only_folders_are_refused(monkeypatch, material, clip, picture, tmp_path):
+    # The tests may run as root, to whom the system grants any access.
+    monkeypatch.setattr(_files.os, "access", lambda path, mode: not (mode & os.W_OK))
+    read_only = r"needs a writable folder, .+ is read-only; choose another"
+    for words in (
+        ["video", clip, "-o", tmp_path / "out.mp4"],
+        ["video", clip, "-o", tmp_path / "out.mp4", "--tracks", tmp_path / "tracks.csv"],
+        ["detect", picture, "--boxes", tmp_path / "boxes.csv"],
+        ["evaluate", material / "labels.csv", material / "labels.csv", "--json", tmp_path / "scores.json"],
+        ["train", "--vehicles", "v", "--non-vehicles", "n", "-o", tmp_path / "m.safetensors"],
+    ):
+        assert re.search(read_only, refuse(*words))
+    result = run("detect", picture, "-o", tmp_path / "out")
+    assert (result.exit_code, bool(re.search(read_only, result.stderr))) == (2, True)
+    assert contents(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["detcet"], r"No such command 'detcet'.*; see \S+ --help"),
+        (["--fast"], r"No such option: --fast; see \S+ --help"),
+        (["detect", "--fast"], r"No such option: --fast; see \S+ detect --help"),
+        (["detect"], r"Missing argument 'IMAGE...'; see \S+ detect --help"),
+        (
+            ["video", "a.mp4", "--jobs", "many"],
+            r"Invalid value for '--jobs': .*(should be|is not) a valid integer; .*",
+        ),
+        (
+            ["video", *(f"CARD/{number}.MP4" for number in range(1000))],
+            r"Got unexpected .* \(CARD/1.MP4 [^;]{10,120} \.\.\.\); SOURCE is one argument: for several "
+            r"files, pass their folder or a quoted pattern, such as 'CARD/\*.MP4'; see \S+ video --help",
+        ),
+        (["video", "a.mp4", "--labels"], r"Option '--labels' requires an argument; see \S+ --help"),
+    ],
+)
+def test_a_wrong_call_is_an_error_of_one_line(words, message):
+    assert re.fullmatch(f"error: {message}\n", refuse(*words))
+
+
+def test_existing_files_are_replaced_with_a_note(clip, picture, tmp_path):
+    target, boxes = tmp_path / "out.mp4", tmp_path / "boxes.csv"
+    runs = [["video", clip, "-o", target, "--end", 0.1], ["detect", picture, "--boxes", boxes]]
+    for words, path in zip(runs, (target, boxes)):
+        notes = [run(*words).stderr.count(f"note: {path} will be replaced when") for _ in range(2)]
+        assert notes == [0, 1]
+    assert "note" not in run(*runs[0], "--quiet").stderr
+    for words, refused in ((runs[0], ["--jobs", 0]), (runs[0], ["--fov", 200]), (runs[1], ["--horizon", 9])):
+        assert refuse(*words, *refused).startswith("error: --")

@@ -1,0 +1,331 @@
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.cli.commands import HEADER, contents, refuse, refuse_each, run, succeed
+from tests.network.graphs import constant_network
+from tests.video.clips import write_clip
+from vehicle_detection import detector
+from vehicle_detection.boxes import Detections
+from vehicle_detection.images import read_image, write_image
+from vehicle_detection.scenes import SceneVehicle, render_scene
+from vehicle_detection.svm import VehicleClassifier, load_classifier
+from vehicle_detection.video import read_frames
+
+
+def test_detect_writes_annotated_images_and_boxes(monkeypatch, picture, tmp_path):
+    found = [
+        Detections([[10, 20, 60.4, 70], [100, 50, 180, 120]], [1.5, 0.25], [0.82, 0.564]),
+        Detections.empty(),
+    ]
+    answers = iter(found)
+    monkeypatch.setattr(detector.VehicleDetector, "detect", lambda self, image: next(answers))
+    other, folder, boxes = tmp_path / "other.jpg", tmp_path / "new" / "out", tmp_path / "boxes.csv"
+    write_image(other, read_image(picture))
+    out = succeed("detect", picture, other, "-o", folder, "--boxes", boxes)
+    assert out.splitlines() == [
+        f"{picture}: 2 vehicles  [10 20 60 70] 82%  [100 50 180 120] 56%",
+        f"{other}: 0 vehicles",
+        f"wrote 2 boxes to {boxes}",
+        f"wrote {folder}",
+    ]
+    assert boxes.read_text().splitlines() == [
+        f"{HEADER},confidence",
+        "road.png,,10.00,20.00,60.40,70.00,1.5000,0.8200",
+        "road.png,,100.00,50.00,180.00,120.00,0.2500,0.5640",
+    ]
+    assert contents(tmp_path / "new") == ["out", "out/other.jpg", "out/road.png"]
+    changed = (read_image(folder / "road.png") != read_image(picture)).any(axis=2)
+    assert changed[20, 10:60].all()
+    assert changed[50:120, 100].all()
+    assert not changed[130:].any()
+    assert changed[:20, 10:60].any()  # the score
+
+
+def test_detect_draws_scores_and_lines_as_asked(monkeypatch, picture, tmp_path):
+    found = Detections([[100, 60, 180, 120]], [1.5])
+    monkeypatch.setattr(detector.VehicleDetector, "detect", lambda self, image: found)
+    image, changed = read_image(picture), {}
+    for name, words in {"plain": [], "bare": ["--labels", "none"], "wide": ["--line-width", 5]}.items():
+        succeed("detect", picture, "-o", tmp_path / name, *words)
+        changed[name] = (read_image(tmp_path / name / "road.png") != image).any(axis=2)
+    assert changed["plain"][:60].any()
+    assert not changed["bare"][:60].any()
+    assert changed["wide"][90, 100:140].sum() == 5
+
+
+def test_detect_keeps_boxes_of_a_minimum_confidence(tmp_path):
+    cars = [
+        SceneVehicle(distance_m=distance, lateral_m=lateral) for distance, lateral in ((14, 0), (34, 3.6))
+    ]
+    scene = render_scene(shape=(360, 640), vehicles=cars, lane=1, random_state=3)
+    write_image(tmp_path / "road.png", scene.image)
+    counts = {}
+    for conf in (0.1, 0.999):
+        succeed("detect", tmp_path / "road.png", "--conf", conf, "--boxes", tmp_path / "boxes.csv")
+        rows = (tmp_path / "boxes.csv").read_text().splitlines()[1:]
+        assert all(float(row.split(",")[-1]) >= conf for row in rows)
+        counts[conf] = len(rows)
+    assert counts[0.1] > counts[0.999]
+
+
+def test_a_wrong_horizon_gives_a_warning(tmp_path):
+    cars = [
+        SceneVehicle(distance_m=distance, lateral_m=lateral)
+        for distance, lateral in ((15, 0), (19, 3.6), (28, -3.6), (38, 0.3), (42, 3.4))
+    ]
+    scene = render_scene(vehicles=cars, lane=1, random_state=3)
+    write_image(tmp_path / "road.png", scene.image)
+    assert ": 0 vehicles" not in succeed("detect", tmp_path / "road.png", "--horizon", 0.95)
+    highway = "--model", "highway"  # the network searches all rows
+    result = run("detect", tmp_path / "road.png", "--horizon", 0.95, *highway)
+    assert result.exit_code == 0
+    assert ": 0 vehicles" in result.stdout
+    assert re.search(
+        r"warning: no vehicle was found with --horizon 0.95, but a search of all rows found "
+        r"\d boxes, whose horizon is 0.5\d; use --horizon 0.5\d",
+        result.stderr,
+    )
+    write_image(tmp_path / "empty.png", np.full((180, 320, 3), 90, np.uint8))
+    result = run("detect", tmp_path / "empty.png", "--horizon", 0.95, *highway)
+    assert "leave it out if there are some (a search of all rows found too few vehicles" in result.stderr
+    assert run("detect", tmp_path / "empty.png", *highway).stderr == ""
+    assert run("detect", tmp_path / "empty.png", "--horizon", 0.95).stderr == ""
+
+
+def test_an_image_given_twice_is_searched_once(picture, tmp_path):
+    once = succeed("detect", picture, "--boxes", tmp_path / "once.csv")
+    assert once.count("vehicle") == succeed("detect", picture, picture, "--boxes", tmp_path / "b.csv").count(
+        "vehicle"
+    )
+    assert (tmp_path / "b.csv").read_text() == (tmp_path / "once.csv").read_text()
+
+
+def test_patterns_of_images_are_expanded(picture, tmp_path):
+    for name in ("a.png", "b.png", "c[1].png"):
+        shutil.copy(picture, tmp_path / name)
+    (tmp_path / "d.png").mkdir()
+    out = succeed("detect", tmp_path / "?.png", tmp_path / "c[1].png", "--model", "highway")
+    assert [line.partition(":")[0] for line in out.splitlines()] == [
+        str(tmp_path / name) for name in ("a.png", "b.png", "c[1].png")
+    ]
+    # A name with brackets is no pattern, so that a wrong one is refused.
+    assert "[a].png does not exist; check the path" in refuse("detect", tmp_path / "[a].png")
+
+
+def test_detect_accepts_every_kind_of_image(picture, tmp_path):
+    image = cv2.imread(str(picture))
+    gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    kinds = {
+        "rgba.png": cv2.cvtColor(image, cv2.COLOR_BGR2BGRA),
+        "deep.png": image.astype(np.uint16) * 257,
+        "gray.png": gray,
+        "gray_deep.png": gray.astype(np.uint16) * 257,
+        "plain.bmp": image,
+    }
+    for name, pixels in kinds.items():
+        assert cv2.imwrite(str(tmp_path / name), pixels)
+    out = succeed("detect", picture, *(tmp_path / name for name in kinds), "-o", tmp_path / "out")
+    found = {Path(line.partition(": ")[0]).name: line.partition(": ")[2] for line in out.splitlines()[:-1]}
+    assert list(found) == ["road.png", *kinds]
+    assert found["rgba.png"] == found["deep.png"] == found["plain.bmp"] == found["road.png"]
+    assert found["gray.png"] == found["gray_deep.png"]
+    assert contents(tmp_path / "out") == sorted(found)
+
+
+def test_detect_adds_a_suffix_to_an_image_without_one(picture, tmp_path):
+    shutil.copy(picture, tmp_path / "frame7")
+    succeed("detect", tmp_path / "frame7", "-o", tmp_path / "out")
+    assert contents(tmp_path / "out") == ["frame7.png"]
+
+
+def test_a_damaged_but_readable_image_gives_a_warning(picture, tmp_path):
+    write_image(tmp_path / "road.jpg", read_image(picture))
+    data = bytearray((tmp_path / "road.jpg").read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 40] = bytes(40)
+    (tmp_path / "road.jpg").write_bytes(data)
+    result = run("detect", tmp_path / "road.jpg")
+    assert result.exit_code == 0
+    assert re.fullmatch(r"(warning: .+road.jpg: Corrupt JPEG data[^\n]*\n)+", result.stderr)
+
+
+BAD_IMAGES = {
+    "{road} --blur plates": "--output must name a folder for --blur",
+    "missing.png": "IMAGE missing.png does not exist; check the path",
+    "{material}/empty": "IMAGE .+empty is a folder; choose files in it",
+    "{material}/clip.mp4": "clip.mp4 is a video; use vehicle-detection video",
+    "{material}/text.png": "text.png must be a complete image file",
+    "{material}/cut_road.png": "cut_road.png must be a complete image file",
+    "nothing.png": "nothing.png must be a complete image file",
+    "tiny.png --model highway": "image of 12x12 pixels holds no search window",
+    "{road} --horizon 2": "--horizon must be a number, at least 0 and at most 1; got 2",
+    "{road} --horizon nan": "--horizon must be a number, .* got nan",
+    "{road} --conf 7": "--conf must be a number, at least 0 and at most 1; got 7",
+    "{road} -o {material}": "--output .+ is the folder of road.png, which would be overwritten",
+    "{road} -o {road}": "--output must be a folder",
+    "{road} twin/road.png -o out": "have the same file name, .*; process one folder at a time",
+    "{road} --boxes {road}": "--boxes .+road.png is one of the images; choose another",
+    "{road} --labels id": "--labels must be one of 'score', 'none'; got 'id'",
+    "{road} --line-width 0": "--line-width must be an integer from 1 to 1000; got 0",
+    "{road} --boxes boxes.doc": "--boxes must end in .csv or .*, got 'boxes.doc'",
+    "{road} --boxes none/boxes.csv": "--boxes needs an existing folder",
+    "{road} --model none.safetensors": "model file none.safetensors does not exist",
+    "{road} --model motorway": "model file motorway does not exist; .* a shipped model: default, h",
+    "{road} --model {material}/empty": "model file .+empty is a folder",
+    "{road} --model {material}/text.safetensors": "text.safetensors is not a complete safetensors",
+}
+if cv2.__version__ >= "5":  # OpenCV 4 converts floating-point numbers
+    BAD_IMAGES["floats.tiff"] = "floats.tiff must be a complete image file"
+
+
+def test_detect_refuses_bad_input_and_changes_no_file(material, picture, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_image("tiny.png", np.zeros((12, 12, 3), np.uint8))
+    cv2.imwrite("floats.tiff", np.zeros((90, 160, 3), np.float32))
+    Path("nothing.png").touch()
+    Path("twin").mkdir()
+    shutil.copy(picture, "twin")
+    before, original = (contents(tmp_path), contents(material)), picture.read_bytes()
+    refuse_each("detect", BAD_IMAGES, material=material, road=picture)
+    assert (contents(tmp_path), contents(material)) == before
+    assert picture.read_bytes() == original
+
+
+def test_images_that_cannot_be_decoded_are_left_out(picture, material, tmp_path):
+    bad = [material / "cut_road.png", material / "text.png"]
+    words = ("--boxes", tmp_path / "boxes.csv", "-o", tmp_path / "found")
+    result = run("detect", bad[0], picture, bad[1], *words)
+    assert result.exit_code == 3
+    for line, path in zip(result.stderr.splitlines(), bad, strict=True):
+        assert line.startswith(f"warning: image file {path} must be a complete image file")
+        assert line.endswith("; left out")
+    assert succeed("detect", picture, "--boxes", tmp_path / "alone.csv")
+    assert (tmp_path / "boxes.csv").read_text() == (tmp_path / "alone.csv").read_text()
+    assert contents(tmp_path / "found") == [picture.name]
+    # A horizon that hides all vehicles is checked with the other images.
+    assert run("detect", bad[0], picture, "--horizon", 0.95).exit_code == 3
+
+
+def test_no_image_that_can_be_decoded_prevents_the_table(material, tmp_path):
+    (tmp_path / "boxes.csv").write_text("earlier")
+    words = (material / "text.png", material / "cut_road.png", "--boxes", tmp_path / "boxes.csv")
+    result = run("detect", *words)
+    assert result.exit_code == 2
+    assert [line.partition(":")[0] for line in result.stderr.splitlines()] == ["note", "warning", "error"]
+    assert (tmp_path / "boxes.csv").read_text() == "earlier"
+    assert contents(tmp_path) == ["boxes.csv"]
+
+
+def test_damaged_models_are_refused(picture, tmp_path):
+    whole = tmp_path / "whole.safetensors"
+    model = load_classifier()
+    model.save(whole)
+    data = whole.read_bytes()
+    assert succeed("info", whole).startswith(f"{whole}: {model.params.length} features")
+    swapped = bytearray(data)
+    swapped[-5] ^= 255
+    other = data.replace(b'\\"spatial_size\\": 32', b'\\"spatial_size\\": 16')
+    assert len(other) == len(data)
+    assert other != data
+    damaged = {
+        "cut": (data[: len(data) // 2], "is not a complete safetensors file"),
+        "edited": (bytes(swapped), "was changed after it was written"),
+        "other": (other, "was changed after it was written"),
+    }
+    for name, (content, message) in damaged.items():
+        path = tmp_path / f"{name}.safetensors"
+        path.write_bytes(content)
+        assert message in refuse("detect", picture, "--model", path)
+        assert message in refuse("info", path)
+        assert message in refuse("video", tmp_path / "x.mp4", "-o", tmp_path / "y.mp4", "--model", path)
+
+
+def test_a_model_inconsistent_with_its_parameters_is_refused(picture, tmp_path, monkeypatch):
+    model = load_classifier()
+    monkeypatch.setattr(VehicleClassifier, "__post_init__", lambda self: None)
+    VehicleClassifier(replace(model.params, spatial_size=16), model.templates).save(
+        tmp_path / "m.safetensors"
+    )
+    monkeypatch.undo()
+    message = refuse("detect", picture, "--model", tmp_path / "m.safetensors")
+    assert re.search(r"does not fit its own parameters: templates must have \d+ weights", message)
+
+
+def test_detect_explains_each_box(tmp_path):
+    image, why = tmp_path / "road.png", tmp_path / "why"
+    scene = render_scene(shape=(360, 640), vehicles=[SceneVehicle(distance_m=14.0)], lane=1, random_state=1)
+    write_image(image, scene.image)
+    out = succeed("detect", image, "--why", why)
+    line = r"^  1: score (\S+): margin \1 = \S+ cells \S+ rest$"
+    assert re.search(line, out, re.MULTILINE)
+    assert contents(why) == ["road.png_1.png"]
+    assert out.splitlines()[-1] == f"wrote {why}"
+    assert "--why must be a folder" in refuse("detect", image, "--why", image)
+
+
+def test_detect_and_video_blur_vehicles(tmp_path):
+    image, road = tmp_path / "road.png", tmp_path / "road.mp4"
+    car = SceneVehicle(distance_m=14.0, kind="sedan", color="white")
+    scene = render_scene(shape=(360, 640), vehicles=[car], lane=1, random_state=1)
+    write_image(image, scene.image)
+    write_clip(road, [scene.image] * 3)
+    x1, y1, x2, y2 = scene.boxes[0].tolist()
+    inside = slice((3 * y1 + y2) // 4, (y1 + 3 * y2) // 4), slice((3 * x1 + x2) // 4, (x1 + 3 * x2) // 4)
+    contrasts = []
+    for folder, words in (("sharp", []), ("blurred", ["--blur", "vehicles"])):
+        succeed("detect", image, "-o", tmp_path / folder, *words)
+        succeed("video", road, "-o", tmp_path / f"{folder}.mp4", "--preset", "ultrafast", *words)
+        with read_frames(tmp_path / f"{folder}.mp4") as frames:
+            pictures = read_image(tmp_path / folder / "road.png"), next(frames)[2]
+        contrasts.append(
+            [np.abs(np.diff(picture[inside].mean(axis=2), axis=0)).max() for picture in pictures]
+        )
+    assert (np.array(contrasts[1]) < 0.5 * np.array(contrasts[0])).all()
+
+
+def test_images_that_are_too_small_are_left_out(tmp_path):
+    small, image = tmp_path / "small.png", tmp_path / "image.png"
+    write_image(small, np.zeros((20, 40, 3), np.uint8))
+    write_image(image, np.zeros((360, 640, 3), np.uint8))
+    result = run("detect", small, image, "--model", "highway")
+    assert result.exit_code == 3
+    assert f"warning: {small}: image of 40x20 pixels holds no search window" in result.stderr
+    assert str(small) in refuse("detect", small, "--model", "highway")
+
+
+def test_models_by_name(picture):
+    assert re.search(r": \d+ vehicle", succeed("detect", picture))
+    assert succeed("detect", picture, "--model", "default") == succeed("detect", picture)
+    assert re.search(r": \d+ vehicle", succeed("detect", picture, "--model", "highway"))
+
+
+def test_classes_of_a_network(picture, tmp_path):
+    boxes = np.zeros((1, 8, 189), np.float32)
+    boxes[0, :, 0], boxes[0, :, 1] = [48, 48, 24, 24, 0, 0, 0.9, 0], [30, 60, 20, 20, 0.8, 0, 0, 0]
+    outputs = {"output0": boxes}
+    names = {"names": "{0: 'person', 1: 'bicycle', 2: 'car', 3: 'dog'}"}
+    path = tmp_path / "other.onnx"
+    path.write_bytes(constant_network(outputs, metadata=names))
+    assert "1 vehicle" in succeed("detect", picture, "--model", path)
+    assert "2 vehicles" in succeed("detect", picture, "--model", path, "--classes", "0,car")
+    assert "0 vehicles" in succeed("detect", picture, "--model", path, "--classes", "dog")
+    assert re.search(r"classes +car\s", succeed("info", path))
+    message = refuse("detect", picture, "--model", path, "--classes", "tram")
+    assert re.search(r"--classes must be classes of .* got 'tram'; it has person \(0\), bicycle", message)
+    message = refuse("detect", picture, "--model", "highway", "--classes", "car")
+    assert "--classes must be omitted for 'highway', which is no network" in message
+    message = refuse("detect", picture, "--model", path, "--device", "gpu")
+    assert "--device must be one of 'cpu', 'cuda'; got 'gpu'" in message
+
+
+@pytest.mark.realdata
+def test_the_course_images_by_command(real_data, tmp_path):
+    images = sorted((real_data / "test_images").glob("*.jpg"))
+    succeed("detect", *images, "--boxes", tmp_path / "boxes.csv")
+    labels = real_data / "labels" / "test_images.csv"
+    assert "9 found, 0 missed, 0 false" in succeed("evaluate", tmp_path / "boxes.csv", labels)
