@@ -16,14 +16,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
     UNITS,
+    Checked,
     check_boxes,
     check_choice,
     check_flags,
     check_image,
     check_type,
+    checked_field,
+    choice,
     describe,
+    integer,
     is_listing,
-    store_integer,
 )
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera, truncated_edges
@@ -66,8 +69,19 @@ LABEL_FIELDS = ("id", "score", "distance", "speed", "std")
 """Fields of a track's label; ``"std"`` adds standard errors to distance and speed."""
 
 
+def _check_labels(value: Any, name: str) -> tuple[str, ...]:
+    if not isinstance(value, Collection) or getattr(value, "ndim", 1) == 0:
+        raise InvalidInputError(
+            f"{name} must be a list of fields, got {describe(value)}; pass some of {LABEL_FIELDS}"
+        )
+    fields = (value,) if isinstance(value, str) else tuple(value)
+    for field in fields:
+        check_choice(field, name, LABEL_FIELDS)
+    return fields
+
+
 @dataclass(frozen=True, kw_only=True)
-class DrawParams:
+class DrawParams(Checked):
     """How tracks are drawn.
 
     Attributes
@@ -93,42 +107,19 @@ class DrawParams:
     'none'
     """
 
-    labels: Collection[str] = ("id", "distance", "speed")
-    line_width: int | None = None
-    color_by: Literal["id", "distance"] = "id"
-    panel: Literal["none", "corner", "side"] = "none"
-    units: Literal["metric", "imperial"] = "metric"
-
-    def __post_init__(self) -> None:
-        given: object = self.labels
-        if not isinstance(given, Collection) or getattr(given, "ndim", 1) == 0:
-            raise InvalidInputError(
-                f"labels must be a list of fields, got {describe(given)}; pass some of {LABEL_FIELDS}"
-            )
-        fields = (self.labels,) if isinstance(self.labels, str) else tuple(self.labels)
-        for field in fields:
-            check_choice(field, "labels", LABEL_FIELDS)
-        object.__setattr__(self, "labels", fields)
-        if self.line_width is not None:
-            store_integer(self, "line_width", low=1, high=1000)
-        check_choice(self.color_by, "color_by", ("id", "distance"))
-        check_choice(self.panel, "panel", ("none", "corner", "side"))
-        check_choice(self.units, "units", UNITS)
+    labels: Collection[str] = checked_field(("id", "distance", "speed"), _check_labels)
+    line_width: int | None = integer(None, low=1, high=1000)
+    color_by: Literal["id", "distance"] = choice("id", ("id", "distance"))
+    panel: Literal["none", "corner", "side"] = choice("none", ("none", "corner", "side"))
+    units: Literal["metric", "imperial"] = choice("metric", UNITS)
 
 
 Point = tuple[int, int]
-Trail = deque[tuple[float, Point]]
-"""Times in seconds, and positions in pixels, of a track in the last frames."""
+Trail = deque[tuple[float, Point]]  # times (s) and positions (pixels) of a track in the last frames
 
-LANE_WIDTH_M = 3.6
-"""Distance between the lines of the grid, where the camera is in the middle of its lane."""
-
-MAX_SPEED_STD = 3.0
-"""Speeds with a larger standard error, in m/s, are not shown."""
-
-TRAIL_SECONDS = 1.5
-"""Time that a trail covers."""
-
+# Distance between the lines of the grid (the camera is in the middle of its lane), largest standard error of
+# a speed that is shown (m/s), and time that a trail covers.
+LANE_WIDTH_M, MAX_SPEED_STD, TRAIL_SECONDS = 3.6, 3.0, 1.5
 # Distances with a line and a number, by units; and distance (m) that the view covers ahead of the camera and
 # behind it.
 _RANGES = {"metric": (20, 40, 60), "imperial": (75, 150, 225)}
@@ -357,8 +348,8 @@ class OwnSpeed(Protocol):
 class Annotator:
     """Draws everything that an annotated video shows, and remembers what the next frame needs.
 
-    That is the places of the labels and the trails of the bird's-eye view: draw the frames of a video in
-    their order. A frame drawn again is drawn alike; an earlier frame starts anew.
+    These are the places of the labels and the trails of the bird's-eye view, so the frames of a video are
+    drawn in their order. A frame drawn again is drawn alike; an earlier frame starts anew.
 
     Parameters
     ----------
@@ -500,7 +491,7 @@ def draw_tracks(
     line_width: int | None = None,
     color_by: Literal["id", "distance"] = "id",
 ) -> Image:
-    """Draw tracks on a copy of an ``(H, W, 3)`` uint8 RGB image, each with a box and a label.
+    """Draw tracks on a copy of an image, each with a box and a label.
 
     Only tracks with ``track.shown`` are drawn; those without a detection in this frame have dashed boxes.
     Labels are placed where they hide neither other labels nor other vehicles, if necessary on leader lines or
@@ -567,7 +558,7 @@ def draw_diagnostics(
     *,
     params: DrawParams | None = None,
 ) -> Image:
-    """Draw a 2x2 mosaic: the frame, its positive windows, the heat map, the tracks.
+    """Draw a 2x2 mosaic of the frame's shape: the frame, its positive windows, the heat map, the tracks.
 
     Parameters
     ----------
@@ -579,11 +570,6 @@ def draw_diagnostics(
         ``(h, w)`` finite numbers, of the frame's size or smaller; drawn from black (0) to yellow (maximum).
     params
         Labels, units, lines and colors of the tracks; a bird's-eye view is not drawn.
-
-    Returns
-    -------
-    numpy.ndarray
-        An image of the frame's shape; an odd side ends with a black line.
     """
     if params is not None:
         check_type(params, "params", DrawParams, "omit it for the defaults")

@@ -273,7 +273,7 @@ def _break_lines(
     """Lines of a label that is not much wider than its box, their size in pixels, and the font scale."""
     wide = max(box[2] - box[0], _FREE_WIDTH * scale)
     for count in range(1, len(fields) + 1):
-        lines = _split(fields, count)
+        lines = tuple("  ".join(part) for part in np.array_split(fields, count))  # the first ones are longer
         # All digits count as the widest one, so that the size does not change with every number.
         size = text_size([_DIGIT.sub("0", line) for line in lines], scale)
         if size[0] <= wide * (_TOLERANCE if count == last_count else 1.0):
@@ -282,17 +282,6 @@ def _break_lines(
         scale *= 0.9
         size = text_size([_DIGIT.sub("0", line) for line in lines], scale)
     return lines, size, scale
-
-
-def _split(fields: Sequence[str], count: int) -> tuple[str, ...]:
-    """Join fields to `count` lines, the first lines with more fields."""
-    per_line, longer = divmod(len(fields), count)
-    lines, start = [], 0
-    for number in range(count):
-        end = start + per_line + (number < longer)
-        lines.append("  ".join(fields[start:end]))
-        start = end
-    return tuple(lines)
 
 
 def _free_place(
@@ -400,7 +389,6 @@ def draw_boxes(
 
     Examples
     --------
-    >>> import numpy as np
     >>> drawn = draw_boxes(np.zeros((40, 60, 3), np.uint8), [[10, 5, 30, 25]], thickness=1)
     >>> drawn[5, 10].tolist(), drawn[24, 29].tolist(), int(drawn.any(axis=2).sum())
     ([0, 0, 255], [0, 0, 255], 76)
@@ -415,7 +403,7 @@ def draw_boxes(
 
 def _check_color(color: Color) -> Color:
     """Return a color as Python's integers, which OpenCV needs."""
-    if np.shape(check_array(color, "color")) != (3,):
+    if check_array(color, "color").shape != (3,):
         raise InvalidInputError(f"color must be (red, green, blue), 0-255 each; got {describe(color)}")
     red, green, blue = (check_integer(value, "color", low=0, high=255) for value in color)
     return red, green, blue
@@ -430,14 +418,10 @@ def score_texts(detections: Detections) -> list[str]:
 def draw_labeled_bboxes(image: Image, labels: tuple[NDArray[Any], int]) -> Image:
     """Draw the bounding box of each labeled region on a copy of an image, as the course does.
 
-    Parameters
-    ----------
-    labels
-        The label array ``(H, W)`` and the number of regions, as ``scipy.ndimage.label`` returns them.
+    `labels` are the label array ``(H, W)`` and the number of regions, what ``scipy.ndimage.label`` returns.
 
     Examples
     --------
-    >>> import numpy as np
     >>> from scipy import ndimage
     >>> heat = np.zeros((40, 60))
     >>> heat[10:30, 20:50] = 1
@@ -483,7 +467,6 @@ def draw_detections(
 
     Examples
     --------
-    >>> import numpy as np
     >>> found = Detections([[40, 40, 90, 80]], [1.25])
     >>> drawn = draw_detections(np.zeros((90, 160, 3), np.uint8), found, scores=False)
     >>> np.argwhere(drawn.any(axis=2)).min(axis=0).tolist()
