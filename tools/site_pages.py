@@ -37,16 +37,15 @@ README_SECTIONS = ("Start", "Your own video", "In a notebook")
 
 # Pages of the API reference: name, title, and modules of the package whose public names they describe.
 API_PAGES = (
-    ("detect", "Detect and track", "detector stream tracking boxes"),
-    ("camera", "Camera and events", "camera events"),
-    ("video", "Video, batches and reports", "video batch report"),
-    ("images", "Images, drawing and tables", "images drawing export"),
-    ("models", "Models and training", "loading network classifier training"),
+    ("detect", "Detect and track", "detector tracking boxes camera function_model"),
+    ("video", "Video and drawing", "video annotator drawing images"),
+    ("drive", "Events, reports and batches", "events report batch"),
+    ("tables", "Tables and files", "tables export"),
+    ("models", "Models and training", "loading network svm transformer training"),
     ("explain", "Explain and explore", "explanation notebook"),
     ("course_steps", "Features, windows and heat maps", "features windows search heatmap regions course"),
-    ("evaluation", "Evaluation and tuning", "evaluation tuning"),
+    ("evaluation", "Evaluation", "evaluation"),
     ("datasets", "Data sets and rendered scenes", "datasets scenes"),
-    ("params", "Parameters", "params"),
     ("errors", "Errors", "errors"),
 )
 API_MODULES = ("notebook", "course")  # public names that are modules; each has a page
