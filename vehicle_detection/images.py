@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
+import io
 import os
+import re
+import struct
 from pathlib import Path
 
 import cv2
@@ -18,7 +22,6 @@ from vehicle_detection._common import (
     check_path,
     describe,
     hide_credentials,
-    image_size,
     is_url,
     read_regular_file,
 )
@@ -44,6 +47,44 @@ def _thumbnail_pixels(shape: tuple[int, ...]) -> tuple[NDArray[np.intp], ...]:
 def is_cut(first: NDArray[np.float32], second: NDArray[np.float32]) -> bool:
     """Whether the scene was cut between two consecutive frames, given their thumbnails."""
     return float(cv2.norm(first, second, cv2.NORM_L1)) > _CUT_DIFFERENCE * first.size
+
+
+# What a format's files begin with, and the class of Pillow that reads their header.
+_HEADERS = {
+    rb"\xff\xd8\xff": "JpegImagePlugin.JpegImageFile",
+    rb"BM": "BmpImagePlugin.BmpImageFile",
+    rb"RIFF.{4}WEBP": "WebPImagePlugin.WebPImageFile",
+    rb"P[1-6][\s#]": "PpmImagePlugin.PpmImageFile",
+    rb"\0\0\0\x0cjP  |\xff\x4f\xff\x51": "Jpeg2KImagePlugin.Jpeg2KImageFile",
+}
+
+
+def image_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height of an encoded image in pixels; None if the format is unknown or the header damaged.
+
+    Only the header is read: OpenCV states the size after it has decoded the image, and a small file may claim
+    gigabytes. Pillow's ``Image.open`` has a limit of its own, and refuses PNG files for their metadata.
+    """
+    try:
+        if re.match(rb"\x89PNG\r\n\x1a\n.{4}IHDR", data, re.DOTALL):
+            return struct.unpack_from(">II", data, 16)
+        if re.match(rb"GIF8[79]a", data):
+            return struct.unpack_from("<HH", data, 6)
+        file = io.BytesIO(data)
+        if re.match(rb"II[*+]\0|MM\0[*+]", data):  # the tags only: Pillow knows fewer kinds of pixels
+            tiff = importlib.import_module("PIL.TiffImagePlugin")
+            tags = tiff.ImageFileDirectory_v2(data[: 16 if b"+" in data[2:4] else 8])
+            file.seek(tags.next)
+            tags.load(file)
+            return int(tags[256]), int(tags[257])
+        for magic, reader in _HEADERS.items():
+            if re.match(magic, data, re.DOTALL):
+                module, name = reader.split(".")
+                width, height = getattr(importlib.import_module(f"PIL.{module}"), name)(file).size
+                return int(width), int(height)
+    except Exception:  # Pillow's plugins raise anything for a damaged header
+        return None
+    return None
 
 
 def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:

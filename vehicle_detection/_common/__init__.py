@@ -34,7 +34,6 @@ from vehicle_detection._common.files import (
     temporary_folder,
     write_text,
 )
-from vehicle_detection._common.image_size import image_size
 from vehicle_detection._common.limits import Limit, check_regular_file, read_regular_file
 from vehicle_detection._common.model_file import FORMAT_VERSION, read_model, write_model
 from vehicle_detection._common.parquet import ParquetRows, import_pyarrow, write_parquet
@@ -98,7 +97,6 @@ __all__ = [
     "flag",
     "format_with_error",
     "hide_credentials",
-    "image_size",
     "import_pyarrow",
     "in_notebook",
     "integer",

@@ -25,7 +25,6 @@ from vehicle_detection._common import (
     check_sequence,
     check_shape,
     describe,
-    image_size,
     read_regular_file,
     shorten,
 )
@@ -45,7 +44,7 @@ from vehicle_detection.evaluation.frame_boxes import (
     without_suffix,
 )
 from vehicle_detection.export import BOX_COLUMNS, FOLDER_FORMATS, FORMATS
-from vehicle_detection.images import read_image
+from vehicle_detection.images import image_size, read_image
 
 REQUIRED_LABEL_COLUMNS = ("frame", "track", "x1", "y1", "x2", "y2")
 LABEL_COLUMNS = (*REQUIRED_LABEL_COLUMNS, "occluded", "truncated", "ignore")
