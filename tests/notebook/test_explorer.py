@@ -219,24 +219,6 @@ def test_a_higher_threshold_of_a_network_needs_no_search(scenes, count_searches)
     assert counts[0] > counts[1] > counts[2]
 
 
-def test_the_cache_is_limited(scenes, monkeypatch, count_searches):
-    monkeypatch.setattr(module, "_CACHED_SEARCHES", 2)
-    monkeypatch.setattr(module, "_CACHED_FRAMES", 1)
-    explorer = explore(scenes)
-    searches = count_searches(explorer)
-    for horizon in (0.5, 0.52, 0.54):
-        explorer.set_search(horizon=horizon)
-        explorer.windows()
-    explorer.set_frame(1)
-    explorer.windows()
-    assert explorer._search_frame.cache_info().currsize == 2
-    assert explorer._read_frame.cache_info().currsize == 1
-    before = len(searches)
-    explorer.set_frame(0)
-    explorer.windows()  # horizon 0.54 is still cached
-    assert len(searches) == before
-
-
 def test_parameters_may_be_assigned(explorer):
     before = len(explorer.windows())
     bands = explorer.search_params.bands

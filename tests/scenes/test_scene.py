@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.helpers import ROOT, check_truth
-from vehicle_detection import scenes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image
 from vehicle_detection.scenes import SceneVehicle, render_scene
@@ -25,10 +24,6 @@ scene_vehicles = st.builds(
     view=st.sampled_from(["rear", "front"]),
     speed_mps=st.floats(-30.0, 30.0),
 )
-
-
-def test_the_public_names_exist():
-    assert set(scenes.__all__) <= set(dir(scenes))
 
 
 def test_the_same_seed_gives_the_same_bytes():
