@@ -38,6 +38,21 @@ def start(*words, **options):
     return start_interruptible(sys.executable, "-m", "vehicle_detection", *words, **options)
 
 
+def start_changed(code, *words):
+    """Start a command in a program that runs some code first, such as one that replaces a function."""
+    tail = "import sys; sys.argv[0] = 'vehicle-detection'; from vehicle_detection.cli import main; main()"
+    return start_interruptible(sys.executable, "-c", f"{code}\n{tail}", *words)
+
+
+def failing(error):
+    """Make a function that raises an error, whatever its arguments."""
+
+    def fail(*_, **__):
+        raise error
+
+    return fail
+
+
 def finish(process):
     out, errors = process.communicate(timeout=300)
     return process.returncode, out, errors

@@ -11,8 +11,18 @@ import pytest
 import typer
 
 import vehicle_detection
-from tests.cli.commands import COMMANDS, contents, finish, refuse, refuse_each, run, start, succeed
-from tests.helpers import start_interruptible
+from tests.cli.commands import (
+    COMMANDS,
+    contents,
+    failing,
+    finish,
+    refuse,
+    refuse_each,
+    run,
+    start,
+    start_changed,
+    succeed,
+)
 from vehicle_detection import detector
 from vehicle_detection._common import files as _files
 from vehicle_detection.cli.app import app
@@ -89,11 +99,9 @@ def test_ctrl_c_leaves_nothing_behind(tmp_path, material):
     long = tmp_path / "long.mp4"
     draw_clip(render_drive(frames=1, shape=(270, 480), scenario="empty"), long, tmp_path / "labels.csv")
     slow = (
-        "import time, sys\n"
+        "import time\n"
         "import vehicle_detection.{module} as module\n"
-        "module.{name} = lambda *a, **k: (print('now', flush=True), time.sleep(600))\n"
-        "sys.argv = ['vehicle-detection', *sys.argv[1:]]\n"
-        "from vehicle_detection.cli import main; main()"
+        "module.{name} = lambda *a, **k: (print('now', flush=True), time.sleep(600))"
     )
     out, patches = tmp_path / "out", (material / "vehicles", material / "non-vehicles")
     runs = {
@@ -105,8 +113,7 @@ def test_ctrl_c_leaves_nothing_behind(tmp_path, material):
     }  # fmt: skip
     out.mkdir()
     processes = [
-        start_interruptible(sys.executable, "-c", slow.format(module=module, name=name), *words)
-        for (module, name), words in runs.items()
+        start_changed(slow.format(module=module, name=name), *words) for (module, name), words in runs.items()
     ]
     for process in processes:
         assert process.stdout.readline() == "now\n"
@@ -117,29 +124,20 @@ def test_ctrl_c_leaves_nothing_behind(tmp_path, material):
 
 
 def test_an_interrupted_command_leaves_no_file(monkeypatch, picture, tmp_path):
-    def interrupt(self, image):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(detector.VehicleDetector, "detect", interrupt)
+    monkeypatch.setattr(detector.VehicleDetector, "detect", failing(KeyboardInterrupt()))
     result = run("detect", picture, "-o", tmp_path / "a" / "b", "--boxes", tmp_path / "boxes.csv")
     assert (result.exit_code, result.stdout, result.stderr) == (130, "", "interrupted\n")
     assert contents(tmp_path) == []
 
 
 def test_a_full_disk_is_one_line(monkeypatch, picture, tmp_path):
-    def fill(source, target, *rest, **options):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "replace", fill)
+    monkeypatch.setattr(Path, "replace", failing(OSError(errno.ENOSPC, "No space left on device")))
     assert "No space left" in refuse("detect", picture, "--boxes", tmp_path / "boxes.csv")
     assert contents(tmp_path) == []
 
 
 def test_unexpected_errors_keep_their_traceback(monkeypatch, picture):
-    def fail(self, image):
-        raise RuntimeError("a bug")
-
-    monkeypatch.setattr(detector.VehicleDetector, "detect", fail)
+    monkeypatch.setattr(detector.VehicleDetector, "detect", failing(RuntimeError("a bug")))
     with pytest.raises(RuntimeError, match="a bug"):
         run("detect", picture)
 

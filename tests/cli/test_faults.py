@@ -15,8 +15,8 @@ import numba
 import numpy as np
 import pytest
 
-from tests.cli.commands import run
-from tests.helpers import ROOT, start_interruptible
+from tests.cli.commands import failing, finish, run, start_changed
+from tests.helpers import ROOT
 from tests.video.clips import gray_frames, write_clip
 from vehicle_detection import detector, events, export, report, video
 from vehicle_detection._common import files
@@ -44,25 +44,23 @@ def contents(folder):
 
 # --- signals ---
 
-# A command that reports when it writes, and then waits.
+# The program reports that it writes, and then waits.
 PAUSED = """
-import sys, time
-from vehicle_detection.video import pipeline
-emit = pipeline.FramePipeline._emit
+import time
+from vehicle_detection.video import writing
+put = writing._Sink.put
 def pause(self, *args, **kwargs):
-    emit(self, *args, **kwargs)
+    put(self, *args, **kwargs)
+    time.sleep(0.5)
     print("now", flush=True)
     time.sleep(1)
-pipeline.FramePipeline._emit = pause
-sys.argv = ["vehicle-detection", *sys.argv[1:]]
-from vehicle_detection.cli import main
-main()
+writing._Sink.put = pause
 """
 
 
 def start_video(clip, folder):
     words = ["video", clip, "-o", folder / "out.mp4", "--tracks", folder / "out.csv", "--model", "highway"]
-    process = start_interruptible(sys.executable, "-c", PAUSED, *words)
+    process = start_changed(PAUSED, *words)
     line = process.stdout.readline()
     assert line == "now\n", process.communicate()
     return process
@@ -120,12 +118,9 @@ def test_an_early_interrupt_has_no_traceback(delay):
         "        signal.signal = original\n"
         "        print('now', flush=True)\n"  # what Python prints at an earlier interrupt is not ours
         "    return before\n"
-        "signal.signal = note\n"
-        "sys.argv = ['vehicle-detection', 'info']\n"
-        "from vehicle_detection.cli import main\n"
-        "main()"
+        "signal.signal = note"
     )
-    process = start_interruptible(sys.executable, "-c", code)
+    process = start_changed(code, "info")
     assert process.stdout.readline() == "now\n", process.communicate()
     time.sleep(delay)
     process.send_signal(signal.SIGINT)
@@ -140,22 +135,16 @@ def test_an_interrupt_while_the_commands_are_imported():
         "    def find_spec(self, name, *rest):\n"
         "        if name == 'typer':\n"
         "            os.kill(os.getpid(), signal.SIGINT)\n"
-        "sys.meta_path.insert(0, Interrupt())\n"
-        "from vehicle_detection.cli import main; main()"
+        "sys.meta_path.insert(0, Interrupt())"
     )
-    process = start_interruptible(sys.executable, "-c", code)
+    process = start_changed(code)
     assert process.communicate(timeout=60) == ("", "interrupted\n")
     assert process.returncode == 130
 
 
 def test_an_interrupt_after_a_command_changes_nothing():
-    code = (
-        "import atexit, os, signal, sys\n"
-        "atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))\n"
-        "sys.argv = ['vehicle-detection', 'info']\n"
-        "from vehicle_detection.cli import main; main()"
-    )
-    process = start_interruptible(sys.executable, "-c", code)
+    code = "import atexit, os, signal; atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))"
+    process = start_changed(code, "info")
     out, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) == (0, "")
     assert out.startswith("default: ")
@@ -177,12 +166,9 @@ def train(*_, **__):
         print("now", flush=True)
         executor.submit(time.sleep, 600).result()
 training.train_and_evaluate = train
-sys.argv = ["vehicle-detection", *sys.argv[1:]]
-from vehicle_detection.cli import main
-main()
 """
     words = ["train", "--vehicles", tmp_path / "vehicles", "--non-vehicles", tmp_path / "others"]
-    process = start_interruptible(sys.executable, "-c", code, *words, "-o", tmp_path / "x.safetensors")
+    process = start_changed(code, *words, "-o", tmp_path / "x.safetensors")
     assert process.stdout.readline() == "now\n", process.communicate()
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
@@ -291,10 +277,8 @@ def test_a_target_that_becomes_a_folder_while_the_video_is_made(clip, tmp_path, 
 
 
 def test_a_demo_folder_that_is_read_only(tmp_path, monkeypatch):
-    def refuse(*_, **__):
-        raise OSError(errno.EROFS, "Read-only file system", str(tmp_path / ".demo.x"))
-
-    monkeypatch.setattr(files.tempfile, "mkdtemp", refuse)
+    error = OSError(errno.EROFS, "Read-only file system", str(tmp_path / ".demo.x"))
+    monkeypatch.setattr(files.tempfile, "mkdtemp", failing(error))
     result = run("demo", "-o", tmp_path)
     assert result.exit_code == 2
     assert "cannot be written (Read-only file system); check the folder, or choose another" in result.stderr
@@ -306,14 +290,10 @@ import sys, imageio_ffmpeg
 def fail():
     raise RuntimeError("No ffmpeg exe could be found.")
 imageio_ffmpeg.get_ffmpeg_exe = fail
-sys.argv = ["vehicle-detection", *sys.argv[1:]]
-from vehicle_detection.cli import main
-main()
 """
-    command = [sys.executable, "-c", code, "demo", "-o", str(tmp_path), "--frames", "3"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 2
-    assert done.stderr.startswith("error: no ffmpeg program was found; install ffmpeg, or set")
+    code, _, errors = finish(start_changed(code, "demo", "-o", tmp_path, "--frames", 3))
+    assert code == 2
+    assert errors.startswith("error: no ffmpeg program was found; install ffmpeg, or set")
     assert contents(tmp_path) == []
 
 
@@ -334,11 +314,8 @@ def test_an_interrupted_batch_leaves_no_empty_folder(clip, tmp_path):
 import sys, time
 from vehicle_detection import batch
 batch.run_batch = lambda *_, **__: (print("now", flush=True), time.sleep(600))
-sys.argv = ["vehicle-detection", *sys.argv[1:]]
-from vehicle_detection.cli import main
-main()
 """
-    process = start_interruptible(sys.executable, "-c", code, "batch", clip, "-o", tmp_path / "new" / "out")
+    process = start_changed(code, "batch", clip, "-o", tmp_path / "new" / "out")
     assert process.stdout.readline() == "now\n", process.communicate()
     assert contents(tmp_path / "new") == ["out"]
     process.send_signal(signal.SIGINT)
@@ -419,25 +396,20 @@ def test_closed_outputs(tmp_path, closed):
         assert "Traceback" not in done.stderr
 
 
-def test_memory_that_runs_out(monkeypatch, clip, tmp_path):
-    def fail(*_, **__):
-        raise MemoryError
-
-    monkeypatch.setattr(detector.VehicleDetector, "search", fail)
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (MemoryError(), "error: memory ran out; close other programs"),
+        (RuntimeError("can't start new thread"), "error: the system refuses to start another thread; close"),
+        (OSError(errno.EIO, "Input/output error", "disk"), "error: disk: Input/output error\n"),
+    ],
+)
+def test_errors_of_the_system_are_one_line(monkeypatch, clip, tmp_path, error, message):
+    monkeypatch.setattr(detector.VehicleDetector, "search", failing(error))
     result = run("video", clip, "-o", tmp_path / "out.mp4", "--model", "highway")
-    assert result.exit_code == 2
-    assert result.stderr.startswith("error: memory ran out; close other programs")
+    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
+    assert result.stderr.startswith(message)
     assert contents(tmp_path) == []
-
-
-def test_a_thread_that_cannot_be_started(monkeypatch, clip, tmp_path):
-    def fail(*_, **__):
-        raise RuntimeError("can't start new thread")
-
-    monkeypatch.setattr(detector.VehicleDetector, "search", fail)
-    result = run("video", clip, "-o", tmp_path / "out.mp4", "--model", "highway")
-    assert result.exit_code == 2
-    assert result.stderr.startswith("error: the system refuses to start another thread; close other")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full of Linux")
@@ -471,18 +443,6 @@ def test_no_home_no_terminal_an_ascii_locale_and_a_gigabyte_of_memory(tmp_path):
 
 
 def test_a_cache_of_kernels_that_is_not_writable(monkeypatch):
-    def refuse(*_, **__):
-        raise RuntimeError("cannot cache function 'add': no locator available for file 'kernels.py'")
-
-    monkeypatch.setattr(numba.core.caching.FunctionCache, "__init__", refuse)
+    error = RuntimeError("cannot cache function 'add': no locator available for file 'kernels.py'")
+    monkeypatch.setattr(numba.core.caching.FunctionCache, "__init__", failing(error))
     assert jit(lambda x: x + 1)(2) == 3
-
-
-def test_other_errors_of_the_system_are_one_line(monkeypatch, clip, tmp_path):
-    def fail(*_, **__):
-        raise OSError(errno.EIO, "Input/output error", "disk")
-
-    monkeypatch.setattr(detector.VehicleDetector, "search", fail)
-    result = run("video", clip, "-o", tmp_path / "out.mp4", "--model", "highway")
-    assert (result.exit_code, result.stderr) == (2, "error: disk: Input/output error\n")
-    assert contents(tmp_path) == []
