@@ -7,6 +7,7 @@ import inspect
 import re
 from collections.abc import Callable
 from dataclasses import fields
+from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 from typer import Option
@@ -126,6 +127,8 @@ Preset = Annotated[
     output_option("NAME", "Speed of the encoder, from ultrafast (large files) to placebo (small ones)."),
 ]
 NoAudio = Annotated[bool, output_flag("--no-audio", "Write no sound.")]
+Vehicles = Annotated[Path, option("PATH", "Folder or zip of patches of vehicles, such as vehicles.zip.")]
+NonVehicles = Annotated[Path, option("PATH", "Folder or zip of other patches, such as non-vehicles.zip.")]
 
 
 def parse_time(text: str | None, name: str) -> float | None:

@@ -182,6 +182,15 @@ def print_facts(title: str, facts: Mapping[str, Any]) -> None:
         print_line(f"  {name:<{width}}  {text}", indent=width + 4)
 
 
+def check_targets(targets: Mapping[str, Path | None], sources: Mapping[str, Path]) -> list[Path]:
+    """Refuse targets that cannot be written or are also a source or another target; return those named."""
+    from vehicle_detection._common import check_target
+
+    named = {name: check_target(path, name) for name, path in targets.items() if path is not None}
+    check_distinct_paths(named, sources)
+    return list(named.values())
+
+
 def check_distinct_paths(targets: Mapping[str, Path | None], sources: Mapping[str, Path]) -> None:
     """Refuse a target that is also a source or another target."""
     seen = {_file_key(path): f"{name} {path}" for name, path in sources.items()}

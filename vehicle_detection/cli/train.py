@@ -7,10 +7,11 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from vehicle_detection.cli.options import PATCHES, flag, option
+from vehicle_detection.cli.options import PATCHES, NonVehicles, Vehicles, flag, option
 from vehicle_detection.cli.output import (
     capture_stderr,
     check_distinct_paths,
+    check_targets,
     name_kept_files,
     option_names,
     print_line,
@@ -24,10 +25,8 @@ if TYPE_CHECKING:
 
 @option_names(random_state="--seed", patches_or_labels=PATCHES, patch_set=PATCHES)
 def train(
-    vehicles: Annotated[Path, option("PATH", "Folder or zip of patches of vehicles, such as vehicles.zip.")],
-    non_vehicles: Annotated[
-        Path, option("PATH", "Folder or zip of other patches, such as non-vehicles.zip.")
-    ],
+    vehicles: Vehicles,
+    non_vehicles: NonVehicles,
     output: Annotated[
         Path, option("FILE", "Model file to write, such as own.safetensors.", "-o", "--output")
     ],
@@ -55,14 +54,14 @@ def train(
     ] = None,
 ) -> None:
     """Train a model on patches, and evaluate it on held-out patches; by default like the model "highway"."""
-    from vehicle_detection._common import check_target, encodable, write_text
+    from vehicle_detection._common import encodable, write_text
     from vehicle_detection.datasets import load_training_patches
     from vehicle_detection.features import FeatureParams
     from vehicle_detection.training import model_card, train_and_evaluate
 
-    named = {"--output": output, "--report": report, "--card": card}
-    targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
-    check_distinct_paths({"--non-vehicles": non_vehicles, **targets}, {"--vehicles": vehicles})
+    check_distinct_paths({"--non-vehicles": non_vehicles}, {"--vehicles": vehicles})
+    sources = {"--vehicles": vehicles, "--non-vehicles": non_vehicles}
+    targets = check_targets({"--output": output, "--report": report, "--card": card}, sources)
     with option_names(preset="--features"):
         presets = [FeatureParams.preset(features)]
     with option_names(preset="--compare"):
@@ -82,7 +81,7 @@ def train(
     others = [other for _, other in rest]
     for each in (evaluated, *others):
         _print_report(each)
-    with name_kept_files(targets.values()):
+    with name_kept_files(targets):
         classifier.save(output)
         if report is not None:
             plain = evaluated.to_dict() | {"others": [other.to_dict() for other in others]}
@@ -97,7 +96,7 @@ def train(
             command = shlex.join(["vehicle-detection", "train", *words])
             text = model_card(classifier, evaluated, name=output.stem, others=others, command=command)
             write_text(card, encodable(text))
-    print_line(f"wrote {', '.join(map(str, targets.values()))}")
+    print_line(f"wrote {', '.join(map(str, targets))}")
 
 
 def _print_report(report: TrainingReport) -> None:

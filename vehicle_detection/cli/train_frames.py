@@ -9,7 +9,7 @@ from typer import Argument
 
 from vehicle_detection.cli.info import print_held_out
 from vehicle_detection.cli.options import option
-from vehicle_detection.cli.output import check_distinct_paths, name_kept_files, option_names, print_line
+from vehicle_detection.cli.output import check_targets, name_kept_files, option_names, print_line
 
 
 @option_names(random_state="--seed", sources="DATA", initial="--model")
@@ -37,12 +37,10 @@ def train_frames(
 
     An interrupted training is continued by the same command.
     """
-    from vehicle_detection._common import check_suffix, check_target, pluralize
+    from vehicle_detection._common import check_suffix, pluralize
     from vehicle_detection.training import find_sources, fine_tune_network, write_curves
 
-    named = {"--output": output, "--curves": curves}
-    targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
-    check_distinct_paths(targets, {"DATA": data})
+    targets = check_targets({"--output": output, "--curves": curves}, {"DATA": data})
     check_suffix(output, "--output", (".onnx",))
     sources = find_sources(data)
     for source in sources:
@@ -68,10 +66,10 @@ def train_frames(
         if checkpoint.exists():
             error.args = (f"; the same command continues from {checkpoint}",)
         raise
-    with name_kept_files(targets.values()):
+    with name_kept_files(targets):
         tuned.model.save(output)
         if curves is not None:
             write_curves(curves, tuned.folds)
     metrics = tuned.model.metadata["metrics"]
     print_held_out(metrics["held_out"], metrics["held_out_before"])
-    print_line(f"wrote {', '.join(map(str, targets.values()))}")
+    print_line(f"wrote {', '.join(map(str, targets))}")

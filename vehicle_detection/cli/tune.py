@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from vehicle_detection.cli.options import PATCHES, flag, option
+from vehicle_detection.cli.options import PATCHES, NonVehicles, Vehicles, flag, option
 from vehicle_detection.cli.output import (
-    check_distinct_paths,
+    check_targets,
     option_names,
     print_line,
     print_table,
@@ -36,10 +36,8 @@ _MAX_ROWS = 15
     patch_set=PATCHES,
 )
 def tune(
-    vehicles: Annotated[Path, option("PATH", "Folder or zip of patches of vehicles, such as vehicles.zip.")],
-    non_vehicles: Annotated[
-        Path, option("PATH", "Folder or zip of other patches, such as non-vehicles.zip.")
-    ],
+    vehicles: Vehicles,
+    non_vehicles: NonVehicles,
     grid: Annotated[str, option("GRID", "Values to try: 'orient=8,9 color_space=YCrCb,LAB C=1e-4,1'.")],
     output: Annotated[
         Path,
@@ -66,7 +64,7 @@ def tune(
     cache: Annotated[Path | None, option("DIR", "Folder to keep features in, such as cache.")] = None,
 ) -> None:
     """Train and measure every combination of a grid of parameters, and show the best."""
-    from vehicle_detection._common import check_choice, check_integer, check_target
+    from vehicle_detection._common import check_choice, check_integer
     from vehicle_detection.datasets import load_training_patches
     from vehicle_detection.training import (
         TrialOptions,
@@ -80,13 +78,11 @@ def tune(
     values = parse_grid(grid)
     check_choice(split, "--split", ("sequences", "groups", "random"))
     check_integer(finalists, "--finalists", low=1)
-    targets = {}
+    sources = {"--vehicles": vehicles, "--non-vehicles": non_vehicles}
+    targets = check_targets({"--output": output, "--plot": plot}, sources)
     for name, path, suffixes in (("--output", output, _TABLES), ("--plot", plot, _FIGURES)):
-        if path is not None:
-            targets[name] = check_target(path, name)
-            if path.suffix.lower() not in suffixes:
-                raise InvalidInputError(f"{name} must end in {', '.join(suffixes)}; got {path.name!r}")
-    check_distinct_paths(targets, {"--vehicles": vehicles, "--non-vehicles": non_vehicles})
+        if path is not None and path.suffix.lower() not in suffixes:
+            raise InvalidInputError(f"{name} must end in {', '.join(suffixes)}; got {path.name!r}")
     labelled = _read_frames(frames, labels, horizon)
     # Rows cannot be appended to Parquet, so they are stored in a .jsonl file beside it.
     parquet = output.suffix.lower() == ".parquet"
@@ -114,7 +110,7 @@ def tune(
         write_results(table, output)
     if plot is not None:
         _draw(final, plot)
-    print_line(f"wrote {', '.join(map(str, targets.values()))}")
+    print_line(f"wrote {', '.join(map(str, targets))}")
 
 
 def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None) -> LabelledFrames | None:

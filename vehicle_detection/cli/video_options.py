@@ -149,7 +149,7 @@ class VideoOptions:
             "--events": self.events, "--srt": self.srt,
         }  # fmt: skip
 
-    def span(self) -> dict[str, float | None]:
+    def span(self) -> dict[str, Any]:
         """First and last second of the source."""
         return {"start": parse_time(self.start, "--start"), "end": parse_time(self.end, "--end")}
 
