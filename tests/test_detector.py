@@ -18,6 +18,7 @@ from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.camera import Camera, write_camera
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.drive import OwnSpeed
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections, read_labels
 from vehicle_detection.features import FeatureParams
@@ -29,7 +30,7 @@ from vehicle_detection.scenes import SceneVehicle, render_drive, render_scene
 from vehicle_detection.search import SearchBand, SearchParams
 from vehicle_detection.svm import Template, VehicleClassifier
 from vehicle_detection.tracking import FrameResult, Tracker, TrackParams
-from vehicle_detection.video import OwnSpeed, process_video
+from vehicle_detection.video import process_video
 
 # Most of these frames come without times.
 pytestmark = pytest.mark.filterwarnings("ignore:the speeds assume:UserWarning")

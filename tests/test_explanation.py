@@ -16,9 +16,9 @@ from vehicle_detection import (
     render_scene,
     write_image,
 )
+from vehicle_detection.drive import TrackLog, explain_tracks
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.events import TrackLog
-from vehicle_detection.explanation import explain_tracks, patch_cell_shares
+from vehicle_detection.explanation import patch_cell_shares
 from vehicle_detection.features import part_slices
 from vehicle_detection.function_model import FunctionModel
 from vehicle_detection.scenes import SceneVehicle
@@ -164,9 +164,10 @@ def test_a_detected_box_of_a_track_is_explained(detector, tmp_path, seconds, fra
         write_image(tmp_path / f"{index}.png", SCENE.image)
         larger = box + index * np.array([-1, -1, 1, 1])
         log.add(index, index / 25, [SimpleNamespace(id=1, box=larger, time_since_update=time_since_update)])
-    explained = explain_tracks(detector, tmp_path, log)
-    assert explained[1].frame == frame
-    assert explained[1].explanation.found
+    (picture,) = explain_tracks(detector, tmp_path, log)
+    assert (picture.track, picture.frame) == (1, frame)
+    assert "margin" in picture.text
+    assert "not found" not in picture.text
 
 
 def test_bad_arguments_are_refused(detector):

@@ -29,12 +29,8 @@ ALLOWED = {
     ("training", "scenes"),
 }
 # Folders on their way to a ring.
-MOVING = {
-    "batch": "drive",
-    "events": "drive",
-    "report": "drive",
-}
-KNOWN_UPWARD = {("explanation", "drive"), ("notebook", "scenes"), ("stream", "drive"), ("detector", "drive")}
+MOVING = {}
+KNOWN_UPWARD = {("notebook", "scenes")}
 
 HEAVY = {"matplotlib", "moviepy", "sklearn", "pandas", "pooch", "jinja2", "dask", "pyarrow", "motmetrics"}
 HEAVY |= {"ipywidgets", "IPython"}

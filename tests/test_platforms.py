@@ -7,7 +7,7 @@ from pathlib import Path, PureWindowsPath
 
 import vehicle_detection
 from tests.helpers import ROOT
-from vehicle_detection.video import trips
+from vehicle_detection.drive import trips
 
 FOLDER = Path(vehicle_detection.__file__).parent
 
@@ -111,7 +111,7 @@ import vehicle_detection
 print(len([importlib.import_module(name) for name in names()]))
 
 from vehicle_detection._common import atomic_write, available_cores, temporary_folder
-from vehicle_detection.batch.store import LocalStore
+from vehicle_detection.drive.batch_store import LocalStore
 from vehicle_detection.cli.signals import raise_on_signals
 
 folder = Path(tempfile.mkdtemp())

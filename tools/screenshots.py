@@ -26,8 +26,7 @@ from tools.pictures import MODEL, file_hash, find_errors
 from vehicle_detection import DetectorError, Explorer, VehicleDetectionError, VehicleDetector
 from vehicle_detection._common import atomic_write, write_text
 from vehicle_detection.cli.demo import draw_clip
-from vehicle_detection.events import find_events
-from vehicle_detection.report import ReportWriter
+from vehicle_detection.drive import ReportWriter, find_events
 from vehicle_detection.scenes import render_drive
 from vehicle_detection.video import process_video
 

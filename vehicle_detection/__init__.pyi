@@ -5,7 +5,6 @@ from .annotator import (
     draw_diagnostics,
     draw_tracks,
 )
-from .batch import BatchReport, BatchStatus, batch_status, batch_summary, open_dask, run_batch
 from .boxes import Detections, Platt, clip_boxes, iou_matrix, non_max_suppression
 from .camera import Camera, HorizonEstimate, estimate_horizon, read_camera, write_camera
 from .course import HeatmapDetector
@@ -31,6 +30,28 @@ from .drawing import (
     draw_detections,
     draw_labeled_bboxes,
 )
+from .drive import (
+    BatchReport,
+    BatchStatus,
+    Event,
+    OwnSpeed,
+    ReportWriter,
+    TrackLog,
+    Trip,
+    VehicleCounts,
+    batch_status,
+    batch_summary,
+    count_vehicles,
+    cut_clips,
+    find_events,
+    find_trips,
+    open_dask,
+    open_trip,
+    read_own_speed,
+    run_batch,
+    write_events,
+    write_subtitles,
+)
 from .errors import (
     DatasetError,
     DetectorError,
@@ -54,16 +75,6 @@ from .evaluation import (
     read_labels,
     write_labels,
 )
-from .events import (
-    Event,
-    TrackLog,
-    VehicleCounts,
-    count_vehicles,
-    cut_clips,
-    find_events,
-    write_events,
-    write_subtitles,
-)
 from .explanation import Explanation, explain
 from .export import TrackWriter, write_boxes, write_tracks
 from .features import (
@@ -83,7 +94,6 @@ from .loading import load_model
 from .network import NetworkModel, NetworkParams
 from .notebook import Explorer
 from .regions import RegionParams, find_vehicles
-from .report import ReportWriter
 from .scenes import render_drive, render_patches, render_scene
 from .search import SearchBand, SearchParams, SearchResult
 from .svm import VehicleClassifier, load_classifier
@@ -105,17 +115,13 @@ from .training import (
 from .transformer import PatchFeatures
 from .video import (
     FrameSource,
-    OwnSpeed,
     TrackRun,
-    Trip,
     VideoInfo,
     VideoReport,
-    find_trips,
     open_source,
     probe_video,
     process_video,
     read_frames,
-    read_own_speed,
     track,
     write_video,
 )
@@ -229,6 +235,7 @@ __all__ = [
     "notebook",
     "open_dask",
     "open_source",
+    "open_trip",
     "pareto_front",
     "precision_recall_curve",
     "probe_video",

@@ -11,33 +11,22 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import Floats, check_boxes, check_image, check_type, describe
-from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
-from vehicle_detection.camera import truncated_edges
+from vehicle_detection.boxes import clip_boxes, iou_matrix
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.drawing import (
-    blur_boxes,
-    draw_boxes,
-    draw_cell_shares,
-)
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.events import TrackLog
 from vehicle_detection.features import PATCH_SIZE, FeatureParams, extract_features, part_slices, sum_blocks
 from vehicle_detection.network import NetworkModel, NetworkParams, NetworkSearch
 from vehicle_detection.svm import VehicleClassifier
-from vehicle_detection.video import Source, borrow_source
 
 # IoU from which a found vehicle or a window belongs to a box.
 _MIN_IOU = 0.5
-# Part of an image around a window that a picture shows, as a fraction of its longer side; height of the
-# picture in pixels, and color of its box.
-_AROUND, _PICTURE_HEIGHT, _BOX_COLOR = 0.2, 180, (240, 228, 66)
 # Windows of a classifier of patches are larger than the boxes of vehicles.
 _MIN_WINDOW_IOU = 0.2
 # Occlusion: rows and columns of cells, context around the box as a fraction of its sides, pixels of the input
@@ -159,82 +148,6 @@ def explain(detector: VehicleDetector, image: NDArray[np.uint8], box: ArrayLike)
     if isinstance(model, NetworkModel):
         return _explain_network(detector, model, frame, boxes[0])
     return _explain_classifier(detector, model, frame, boxes[0])
-
-
-# Largest number of tracks that are explained, each of which takes a search of a frame.
-_MAX_EXPLAINED = 12
-
-
-class ExplainedTrack(NamedTuple):
-    """A box of a track that is explained, and a picture of it."""
-
-    frame: int  # in which the box is, counted from the first processed frame
-    picture: NDArray[np.uint8]  # the vehicle, and beside it the same with the shares of the cells
-    explanation: Explanation
-
-
-def explain_tracks(detector: VehicleDetector, source: Source, log: TrackLog) -> dict[int, ExplainedTrack]:
-    """Explain a box of each of the twelve longest tracks: the largest detected one inside the frame.
-
-    Parameters
-    ----------
-    detector, source, log
-        The detector, a source that can be read again, and the tracks of its frames.
-
-    Returns
-    -------
-    dict
-        Explained box of each track, by its id, in ascending order.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, or the model is a function.
-    VideoError
-        If the source cannot be read.
-    """
-    known = [track for track in log.histories() if np.isfinite(track.boxes).all(axis=1).any()]
-    tracks = sorted(known, key=lambda track: -len(track.frames))[:_MAX_EXPLAINED]
-    explained = {}
-    with borrow_source(source) as opened:
-        shape = opened.info.shape[:2]
-        fps = float(opened.info.fps)
-        offset, interval = round((log.first_time or 0.0) * fps), detector.search_interval(fps)
-        for track in tracks:
-            truncated = truncated_edges(track.boxes, shape).any(axis=1)
-            # Predicted boxes have no detection to explain; they are the last choice.
-            detected = (track.columns["time_since_update"] == 0) & (track.frames % interval == 0)
-            weights = np.where(truncated, 0.01, 1.0) * np.where(detected, 1.0, 1e-9)
-            row = int(np.nanargmax(weights * box_areas(track.boxes)))
-            frame = int(track.frames[row])
-            with opened.read(offset + frame, 1) as frames:
-                for _, _, image in frames:
-                    explanation = explain(detector, image, track.boxes[row])
-                    picture = _draw_explanation(detector, image, explanation)
-                    explained[track.id] = ExplainedTrack(frame, picture, explanation)
-    return dict(sorted(explained.items()))
-
-
-def _draw_explanation(
-    detector: VehicleDetector, image: NDArray[np.uint8], explanation: Explanation
-) -> NDArray[np.uint8]:
-    """Draw an explained box twice, side by side: as it is, and with the shares of its cells."""
-    if detector.blur is not None:
-        boxes = np.concatenate([detector.detect(image).boxes, explanation.box[None]])
-        image = blur_boxes(image, boxes, region=detector.blur)
-    both = np.stack([explanation.window, explanation.box])
-    around = _AROUND * (both[:, 2:].max(axis=0) - both[:, :2].min(axis=0)).max()
-    low, high = both[:, :2].min(axis=0) - around, both[:, 2:].max(axis=0) + around
-    left, top = np.maximum(low, 0).astype(int).tolist()
-    right, bottom = np.minimum(high, image.shape[1::-1]).astype(int).tolist()
-    plain = np.ascontiguousarray(image[top:bottom, left:right])
-    scale = _PICTURE_HEIGHT / len(plain)
-    size = max(1, round(scale * plain.shape[1])), _PICTURE_HEIGHT
-    plain = np.asarray(cv2.resize(plain, size, interpolation=cv2.INTER_AREA), np.uint8)
-    corner = np.array([left, top, left, top])
-    shares = draw_cell_shares(plain, (explanation.window - corner) * scale, explanation.cells)
-    shares = draw_boxes(shares, [(explanation.box - corner) * scale], color=_BOX_COLOR, thickness=2)
-    return np.hstack([plain, shares])
 
 
 def _best_overlap(box: Floats, boxes: Floats, min_iou: float) -> int | None:

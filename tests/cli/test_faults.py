@@ -18,10 +18,11 @@ import pytest
 from tests.cli.commands import failing, finish, run, start_changed
 from tests.helpers import ROOT
 from tests.video.clips import gray_frames, write_clip
-from vehicle_detection import detector, events, export, report, video
+from vehicle_detection import detector, export, video
 from vehicle_detection._common import files
 from vehicle_detection._kernels.jit import jit
 from vehicle_detection.cli.signals import raise_on_signals
+from vehicle_detection.drive import event_files, events, report
 from vehicle_detection.errors import OutputError
 from vehicle_detection.images import write_image
 from vehicle_detection.scenes import render_patches, render_scene
@@ -227,14 +228,14 @@ def test_an_interrupt_while_clips_are_cut_keeps_all_other_files(clip, tmp_path, 
         for number, kind in enumerate(kinds)
     )
     monkeypatch.setattr(events, "find_events", lambda *_, **__: found)
-    cut = events.files.cut_video
+    cut = event_files.cut_video
 
     def interrupt(source, target, **options):
         if "closing" in target.name:
             raise KeyboardInterrupt
         return cut(source, target, **options)
 
-    monkeypatch.setattr(events.files, "cut_video", interrupt)
+    monkeypatch.setattr(event_files, "cut_video", interrupt)
     outputs = {"-o": "o.mp4", "--tracks": "o.csv", "--report": "o.html", "--events": "o.json"}
     outputs["--srt"] = "o.srt"
     words = [word for option, name in outputs.items() for word in (option, tmp_path / name)]
@@ -312,8 +313,8 @@ def test_a_demo_names_its_folder_in_errors(tmp_path, monkeypatch):
 def test_an_interrupted_batch_leaves_no_empty_folder(clip, tmp_path):
     code = """
 import sys, time
-from vehicle_detection import batch
-batch.run_batch = lambda *_, **__: (print("now", flush=True), time.sleep(600))
+from vehicle_detection import drive
+drive.run_batch = lambda *_, **__: (print("now", flush=True), time.sleep(600))
 """
     process = start_changed(code, "batch", clip, "-o", tmp_path / "new" / "out")
     assert process.stdout.readline() == "now\n", process.communicate()

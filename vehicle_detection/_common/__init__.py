@@ -38,6 +38,7 @@ from vehicle_detection._common.limits import Limit, check_regular_file, read_reg
 from vehicle_detection._common.model_file import FORMAT_VERSION, read_model, write_model
 from vehicle_detection._common.parquet import ParquetRows, import_pyarrow, write_parquet
 from vehicle_detection._common.progress import in_notebook, progress_bar
+from vehicle_detection._common.signals import postpone
 from vehicle_detection._common.text import encodable, natural_key, pluralize
 from vehicle_detection._common.threads import (
     JOBS_VARIABLE,
@@ -108,6 +109,7 @@ __all__ = [
     "natural_key",
     "number",
     "pluralize",
+    "postpone",
     "progress_bar",
     "read_model",
     "read_regular_file",

@@ -17,7 +17,6 @@ from types import FrameType
 from typing import Any
 
 from vehicle_detection._common.checks import check_path
-from vehicle_detection._signals import ENDING_SIGNALS
 from vehicle_detection.errors import InvalidInputError, OutputError, VehicleDetectionError
 
 _FULL = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
@@ -110,7 +109,7 @@ def _permissions(path: Path) -> int:
 
 @contextlib.contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Delay the handlers of signals that end a program, such as Ctrl-C, until the end of the block.
+    """Delay the handlers of signals, such as Ctrl-C, until the end of the block.
 
     Python calls them in the main thread only; in another thread, the block runs as it is.
     """
@@ -128,7 +127,7 @@ def _uninterrupted() -> Iterator[None]:
             handlers[number](number, frame)
 
     try:
-        for number in ENDING_SIGNALS:
+        for number in signal.valid_signals():
             handler = signal.getsignal(number)
             if callable(handler):  # neither ignored nor the default of the system
                 handlers[number] = handler

@@ -113,7 +113,7 @@ def batch(options: BatchOptions) -> None:
         if options.dry_run:
             raise InvalidInputError("--dry-run has no results for --summary; omit one of them")
     if options.status:
-        from vehicle_detection.batch import batch_status
+        from vehicle_detection.drive import batch_status
 
         print_line(str(batch_status(output)))
         _write_summary(output, summary)
@@ -141,7 +141,7 @@ def batch(options: BatchOptions) -> None:
 def _run(options: BatchOptions, sources: list[str]) -> Any:
     """Process the trips of the sources, on a Dask cluster if one is named."""
     from vehicle_detection._common import is_url, local_path
-    from vehicle_detection.batch import open_dask, run_batch
+    from vehicle_detection.drive import open_dask, run_batch
 
     with contextlib.ExitStack() as stack:
         executor = None
@@ -174,7 +174,7 @@ def _run(options: BatchOptions, sources: list[str]) -> Any:
 def _print_record(record: Mapping[str, Any], *, done: bool) -> None:
     """Warn of a trip without results; with `done` also print others, for logs, which show no progress bar."""
     from vehicle_detection._common import encodable, hide_credentials, pluralize
-    from vehicle_detection.batch import with_source
+    from vehicle_detection.drive import with_source
 
     source = record["sources"][0]["uri"]
     # A log that cannot be written does not end the batch.
@@ -201,7 +201,7 @@ def _write_summary(output: str, summary: Path | None) -> None:
     if summary is None:
         return
     from vehicle_detection._common import atomic_write
-    from vehicle_detection.batch import batch_summary
+    from vehicle_detection.drive import batch_summary
 
     table = batch_summary(output)
     with atomic_write(summary, "--summary") as part:

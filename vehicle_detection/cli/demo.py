@@ -69,10 +69,10 @@ def _run(
 ) -> tuple[VideoReport, TrackScores]:
     """Draw a drive, annotate and score it, oncoming vehicles too; an error leaves no file in the folder."""
     from vehicle_detection._common import temporary_folder
+    from vehicle_detection.drive import ReportWriter
     from vehicle_detection.evaluation import evaluate_tracks, read_labels
     from vehicle_detection.export import TrackWriter
     from vehicle_detection.images import write_image
-    from vehicle_detection.report import ReportWriter
     from vehicle_detection.scenes import render_drive
     from vehicle_detection.video import process_video
 

@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import NoReturn
 
-from vehicle_detection._signals import ENDING_SIGNALS, postpone
-
+# SIGHUP: the terminal was closed. SIGBREAK: Ctrl-Break on Windows, and the end of its terminal.
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+_ENDING_SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 # Seconds after a signal in which others are ignored, so that a second Ctrl-C does not interrupt the cleanup.
 _CLEANUP_SECONDS = 1.0
 
@@ -36,6 +37,8 @@ def raise_on_signals() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    from vehicle_detection._common import postpone  # not at the start, where it takes tenths of a second
+
     last = -_CLEANUP_SECONDS
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -57,7 +60,7 @@ def raise_on_signals() -> Iterator[None]:
 def _set_handlers(handler: signal._HANDLER) -> dict[int, signal._HANDLER]:
     """Set the handler of all signals that are not ignored, as by nohup; return the earlier ones."""
     before: dict[int, signal._HANDLER] = {}
-    for number in ENDING_SIGNALS:
+    for number in _ENDING_SIGNALS:
         if signal.getsignal(number) not in (signal.SIG_IGN, None):
             before[number] = signal.signal(number, handler)
     return before

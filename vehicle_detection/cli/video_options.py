@@ -167,9 +167,9 @@ class VideoOptions:
 
     def open_source(self) -> FrameSource:
         """Open the source."""
-        from vehicle_detection.video import open_source
+        from vehicle_detection.drive import open_trip
 
-        return open_source(
+        return open_trip(
             self.source,
             fps=self.fps,
             live=self.live or None,

@@ -15,9 +15,8 @@ from vehicle_detection.errors import InvalidInputError
 if TYPE_CHECKING:
     from vehicle_detection.cli.video_options import VideoOptions
     from vehicle_detection.detector import VehicleDetector
-    from vehicle_detection.events import Event, TrackLog
-    from vehicle_detection.report import ReportWriter, TrackPicture
-    from vehicle_detection.video import FrameSource, OwnSpeed, VideoReport
+    from vehicle_detection.drive import Event, OwnSpeed, ReportWriter, TrackLog, TrackPicture
+    from vehicle_detection.video import FrameSource, VideoReport
 
 # Fraction of the frames without a known own speed from which on a warning is printed.
 _MAX_UNKNOWN = 0.05
@@ -27,7 +26,7 @@ _MAX_OWN_SPEED = 500.0
 def read_speed(own_speed: str | None, gpx: Path | None, offset: float) -> OwnSpeed | None:
     """Speed of the own vehicle: constant (km/h, or with its unit), from a file, or unknown."""
     from vehicle_detection._common import UNITS, describe
-    from vehicle_detection.video import OwnSpeed, read_own_speed
+    from vehicle_detection.drive import OwnSpeed, read_own_speed
 
     if gpx is not None:
         if own_speed is not None:
@@ -52,7 +51,7 @@ class SideOutputs:
 
     def __init__(self, options: VideoOptions) -> None:
         from vehicle_detection._common import check_choice, check_suffix
-        from vehicle_detection.events import EVENT_SUFFIXES, KINDS, SUBTITLE_SUFFIXES
+        from vehicle_detection.drive import EVENT_SUFFIXES, KINDS, SUBTITLE_SUFFIXES
 
         self._options = options
         self._page: ReportWriter | None = None
@@ -75,9 +74,8 @@ class SideOutputs:
         self, source: FrameSource, detector: VehicleDetector
     ) -> Iterator[list[Callable[[Any], object]]]:
         """Yield functions that take each frame's result; the file of tracks is complete after the block."""
-        from vehicle_detection.events import TrackLog
+        from vehicle_detection.drive import ReportWriter, TrackLog
         from vehicle_detection.export import TrackWriter
-        from vehicle_detection.report import ReportWriter
 
         options = self._options
         writers: list[Callable[[Any], object]] = []
@@ -104,7 +102,7 @@ class SideOutputs:
 
     def write(self, done: VideoReport, detector: VehicleDetector) -> None:
         """Find the events, and write all files but that of the tracks."""
-        from vehicle_detection.events import cut_clips, write_events, write_subtitles
+        from vehicle_detection.drive import cut_clips, write_events, write_subtitles
 
         options, fps, log = self._options, float(done.fps), self._log
         events = self._events = self._find_events(done, detector)
@@ -129,7 +127,7 @@ class SideOutputs:
         """Find the events of a processed video, and warn if the own speed is unknown for a part of it."""
         import numpy as np
 
-        from vehicle_detection.events import find_events
+        from vehicle_detection.drive import find_events
 
         log, fps, speeds = self._log, float(done.fps), None
         if detector.own_speed is not None:
@@ -145,18 +143,14 @@ class SideOutputs:
 
     def _explain(self, detector: VehicleDetector) -> list[TrackPicture]:
         """Explain a box of each vehicle, for the report."""
-        from vehicle_detection.explanation import explain_tracks
-        from vehicle_detection.report import TrackPicture
+        from vehicle_detection.drive import explain_tracks
 
         with self._options.open_source() as source:
-            return [
-                TrackPicture(track_id, found.frame, found.picture, str(found.explanation))
-                for track_id, found in explain_tracks(detector, source, self._log).items()
-            ]
+            return explain_tracks(detector, source, self._log)
 
     def print_summary(self, done: VideoReport) -> None:
         """Print the counts of a drive in one line, and the number of events of each other kind in another."""
-        from vehicle_detection.events import COUNTED, KINDS, count_vehicles
+        from vehicle_detection.drive import COUNTED, KINDS, count_vehicles
 
         if not len(self._log.counts):
             return

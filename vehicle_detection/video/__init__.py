@@ -3,7 +3,6 @@
 from vehicle_detection.video.engine import TrackRun, VideoDetector, VideoReport, track
 from vehicle_detection.video.files import is_video_file, list_files, walk_files
 from vehicle_detection.video.horizon import estimate_video_horizon
-from vehicle_detection.video.own_speed import OwnSpeed, read_own_speed
 from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.remote import download, open_filesystem, with_retries
 from vehicle_detection.video.sources import (
@@ -14,7 +13,6 @@ from vehicle_detection.video.sources import (
     probe_video,
     read_frames,
 )
-from vehicle_detection.video.trips import Trip, find_trips
 from vehicle_detection.video.viewer import Viewer, open_viewer
 from vehicle_detection.video.writing import (
     PRESETS,
@@ -27,10 +25,8 @@ from vehicle_detection.video.writing import (
 __all__ = [
     "PRESETS",
     "FrameSource",
-    "OwnSpeed",
     "Source",
     "TrackRun",
-    "Trip",
     "VideoDetector",
     "VideoInfo",
     "VideoReport",
@@ -40,7 +36,6 @@ __all__ = [
     "cut_video",
     "download",
     "estimate_video_horizon",
-    "find_trips",
     "is_video_file",
     "list_files",
     "open_filesystem",
@@ -49,7 +44,6 @@ __all__ = [
     "probe_video",
     "process_video",
     "read_frames",
-    "read_own_speed",
     "track",
     "walk_files",
     "with_retries",

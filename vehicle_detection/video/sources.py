@@ -42,7 +42,6 @@ from vehicle_detection.video.reading import (
     stream_duration,
 )
 from vehicle_detection.video.remote import download
-from vehicle_detection.video.trips import find_trips
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -427,15 +426,10 @@ def _open(source: object, fps: float, live: bool | None, reconnect: bool) -> Fra
         return _Stream(LiveStream(text, input_options(path)), live=bool(live))
     files = list_files(path) or [check_file(path)]
     if len(files) > 1 and is_video_file(files[0]):
-        trips = find_trips(files, duration=lambda each: probe(each).duration)
-        if len(trips) > 1:
-            listed = "; ".join(f"{trip} from {Path(trip.files[0]).name}" for trip in trips[:4])
-            example = files[0].parent / f"*{Path(trips[0].files[0]).name[-5:]}"
-            raise InvalidInputError(
-                f"source {path} holds {len(trips)} trips ({listed}{', ...' if len(trips) > 4 else ''}); "
-                f"select one with a pattern such as '{example}', or process all with vehicle-detection batch"
-            )
-        files = [Path(file) for file in trips[0].files]
+        raise InvalidInputError(
+            f"source {path} holds {len(files)} videos; open the segments of one trip with open_trip, or pass "
+            "a list of consecutive files"
+        )
     return _open_files(files, fps)
 
 

@@ -1,0 +1,222 @@
+"""Sources that cannot be read for a while, and URLs that are signed for a while."""
+
+import contextlib
+import http.server
+import os
+import threading
+from urllib.parse import parse_qs, urlsplit
+
+import pytest
+
+from tests.drive.batch_helpers import check_whole, counts, files, records, run
+from vehicle_detection import batch_status
+from vehicle_detection.drive import batch_plan as plan
+from vehicle_detection.drive import batch_trip as trip
+from vehicle_detection.drive.batch_plan import list_videos
+from vehicle_detection.errors import InvalidInputError, OutputError
+
+pytestmark = pytest.mark.usefixtures("private_scratch")
+
+
+@pytest.fixture
+def one(card):
+    return card / "20260131_093000_F.mp4"
+
+
+@contextlib.contextmanager
+def away(path):
+    """A file that has gone, such as from a network drive that is not mounted."""
+    hidden = path.with_suffix(".away")
+    path.rename(hidden)
+    yield
+    hidden.rename(path)
+
+
+@contextlib.contextmanager
+def forbidden(path):
+    path.chmod(0)
+    if os.access(path, os.R_OK):
+        path.chmod(0o600)
+        pytest.skip("this user may read every file")
+    yield
+    path.chmod(0o600)
+
+
+@pytest.mark.parametrize("fault", [away, forbidden])
+def test_a_source_without_access_is_an_error_that_the_next_run_repeats(
+    one, model, tmp_path, monkeypatch, fault
+):
+    """It does not change when access is given again, so a failure would be recorded forever."""
+    out = tmp_path / "out"
+
+    def without_access(task):
+        with fault(one):
+            return trip.run_trip(task)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("vehicle_detection.drive.batch.run_trip", without_access)
+        report = run(one, out, model, tracks_only=True)
+    assert counts(report) == (0, 0, 1, 0)
+    assert f"{one} cannot be read (" in next(iter(report.messages.values()))
+    assert counts(run(one, out, model, tracks_only=True)) == (1, 0, 0, 0)
+    check_whole(out, done=1, failed=0)
+
+
+def test_an_error_keeps_the_results_of_earlier_runs(one, model, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    run(one, out, model, tracks_only=True)
+    before = files(out / "tracks")
+    with monkeypatch.context() as patch:
+        # The storage answers neither when the batch starts nor later.
+        patch.setattr(plan, "_identify", lambda *_: {"size": None, "tag": ""})
+        patch.setattr(trip, "process_video", fail)
+        assert counts(run(one, out, model, tracks_only=True)) == (0, 0, 1, 0)
+    assert files(out / "tracks") == before
+    assert sorted(each["status"] for each in records(out).values()) == ["done", "error"]
+    # When it answers again, nothing is done twice, and the error is forgotten.
+    assert counts(run(one, out, model, tracks_only=True)) == (0, 0, 0, 1)
+    assert files(out / "tracks") == before
+    check_whole(out, done=1, failed=0)
+
+
+def fail(*_, **__):
+    raise MemoryError
+
+
+def test_a_source_that_is_bad_now_keeps_its_results(one, model, tmp_path):
+    out, whole = tmp_path / "out", one.read_bytes()
+    run(one, out, model)
+    for size in (3000, 2000):
+        one.write_bytes(whole[:size])
+        assert counts(run(one, out, model)) == (0, 1, 0, 0)
+        check_whole(out, done=1, failed=1)
+    one.write_bytes(whole)
+    assert counts(run(one, out, model)) == (1, 0, 0, 0)
+    check_whole(out, done=1, failed=0)
+
+
+def test_videos_are_written_on_a_local_disk(one, model, tmp_path, monkeypatch):
+    """ffmpeg moves the index of a finished video to its start, which network storage does slowly."""
+    written = []
+    original = trip.process_video
+
+    def process_video(source, target, *words, **options):
+        written.append(target)
+        return original(source, target, *words, **options)
+
+    monkeypatch.setattr(trip, "process_video", process_video)
+    run(one, tmp_path / "out", model)
+    assert written[0].is_relative_to(tmp_path / "scratch")
+
+
+def test_folders_that_cannot_be_read_are_errors(one, model, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "records").write_text("not a folder")
+    with pytest.raises(OutputError, match=r"records cannot be read \(Not a directory\)"):
+        batch_status(out)
+
+    def refuse(path):
+        raise PermissionError(13, "Permission denied", path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    with pytest.raises(InvalidInputError, match=r"sources .+card cannot be listed \(Permission denied\)"):
+        list_videos([one.parent])
+    with pytest.raises(OutputError, match=r"records cannot be read \(Permission denied\)"):
+        run(one, out, model, tracks_only=True)
+
+
+class SignedFiles(http.server.BaseHTTPRequestHandler):
+    """Files of a server that answers GET requests with the current signature only."""
+
+    def do_GET(self):
+        parts = urlsplit(self.path)
+        signature = parse_qs(parts.query).get("X-Amz-Signature")
+        data = self.server.files.get(parts.path[1:], b"")
+        if signature != [self.server.signature]:
+            self.send_response(403)
+            self.end_headers()
+            return
+        start, _, end = self.headers.get("Range", "bytes=0-").removeprefix("bytes=").partition("-")
+        part = data[int(start) : int(end) + 1 if end else None]
+        self.send_response(206 if "Range" in self.headers else 200)
+        self.send_header("Content-Range", f"bytes {start}-{int(start) + len(part) - 1}/{len(data)}")
+        self.send_header("Content-Length", str(len(part)))
+        self.send_header("ETag", f'"{hash(data):x}"')
+        self.end_headers()
+        with contextlib.suppress(ConnectionError):
+            self.wfile.write(part)
+
+    def do_HEAD(self):
+        self.send_response(403)
+        self.end_headers()
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def signed(clip):
+    """A server with two segments of a trip and another drive; `url` signs the URL of a file."""
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), SignedFiles) as server:
+        server.daemon_threads = True
+        names = [f"20260131_{time}_F.mp4" for time in ("081500", "081501", "093000")]
+        server.files = {f"cam/{name}": clip.read_bytes() for name in names}
+        server.signature = "ab12"
+
+        def url(name, signature):
+            date = "X-Amz-Algorithm=AWS4&X-Amz-Date=20300101T120000Z"
+            host = f"http://127.0.0.1:{server.server_address[1]}"
+            return f"{host}/cam/20260131_{name}_F.mp4?{date}&X-Amz-Signature={signature}"
+
+        server.url = url
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+def test_signed_urls_are_the_same_files_when_they_are_signed_again(signed, model, tmp_path):
+    out = tmp_path / "out"
+    names = ("081500", "081501", "093000")
+    assert counts(run([signed.url(name, "ab12") for name in names], out, model, tracks_only=True)) == (
+        2, 0, 0, 0
+    )  # fmt: skip
+    found = check_whole(out, done=2, failed=0)
+    assert {(each["camera"], each["date"]) for each in found.values()} == {("front", "2026-01-31")}
+    assert sorted(each["frames"] for each in found.values()) == [12, 24]
+    assert all(each["size"] for record in found.values() for each in record["sources"])
+    before = files(out)
+    signed.signature = "cd34"
+    again = [signed.url(name, "cd34") for name in names]
+    # An expired signature is an error, which keeps the results.
+    expired = run([signed.url("093000", "ab12")], out, model, tracks_only=True)
+    assert counts(expired) == (0, 0, 1, 0)
+    ((name, message),) = expired.messages.items()
+    assert name.endswith("/cam/20260131_093000_F.mp4")
+    assert "Server returned 403 Forbidden" in message
+    # Signed again, nothing is done twice, and the error is forgotten.
+    assert counts(run(again, out, model, tracks_only=True)) == (0, 0, 0, 2)
+    assert files(out) == before
+    for path in files(out):
+        assert b"ab12" not in path.read_bytes()
+        assert b"cd34" not in path.read_bytes()
+
+
+def test_a_bad_segment_of_a_server_is_named(signed, model, tmp_path):
+    signed.files["cam/20260131_081501_F.mp4"] = b"\0" * 3000
+    urls = [signed.url(name, "ab12") for name in ("081500", "081501")]
+    report = run(urls, tmp_path / "out", model, tracks_only=True)
+    assert counts(report) == (0, 1, 0, 0)
+    (message,) = report.messages.values()
+    start = f"http://127.0.0.1:{signed.server_address[1]}/cam/20260131_081501_F.mp4 is not a video"
+    assert message.startswith(start)
+
+
+def test_the_identity_of_a_url_does_not_depend_on_what_is_hidden_in_its_record():
+    url = "ftp://anna:secret@host/20260131_093000_F.mp4"
+    (found,) = plan.group_files([url], "trip")
+    task = plan.plan_trip(found, {url: {"size": 1}}, {"options": {}}, "")
+    assert task["key"].partition("-")[0] == plan.source_id(url) == plan.trip_id(found)
+    assert "secret" not in task["sources"][0]["uri"]

@@ -1,0 +1,50 @@
+"""The card of a dash-cam: many short segments of two cameras."""
+
+import numpy as np
+import pytest
+
+from tests.drive.batch_helpers import check_whole, counts, run
+from tests.video.clips import write_clip
+from vehicle_detection import FrameBoxes, evaluate_tracks, find_trips, read_labels
+from vehicle_detection.scenes import render_drive
+from vehicle_detection.video import probe_video
+
+pytestmark = pytest.mark.usefixtures("private_scratch")
+
+FRAMES, SEGMENTS = 25, 12
+
+
+def test_a_card_of_twelve_segments_is_one_trip_with_one_identity_per_vehicle(tmp_path):
+    card = tmp_path / "card"
+    card.mkdir()
+    scenes = list(render_drive(frames=FRAMES, shape=(360, 640), scenario="traffic"))
+    # A loop without a jump: forward, then backward. Each segment is a second long.
+    order = [*range(FRAMES), *reversed(range(FRAMES))] * (SEGMENTS // 2)
+    for segment in range(SEGMENTS):
+        frames = [scenes[number].image for number in order[segment * FRAMES :][:FRAMES]]
+        write_clip(card / f"20260131_0815{segment:02}_F.mp4", frames)
+        if segment < 2:
+            mirrored = [np.ascontiguousarray(frame[:, ::-1]) for frame in frames]
+            write_clip(card / f"20260131_0815{segment:02}_R.mp4", mirrored)
+    trips = find_trips(card.iterdir(), duration=lambda file: probe_video(file).duration)
+    assert [(trip.camera, len(trip.files)) for trip in trips] == [("front", SEGMENTS), ("rear", 2)]
+    out = tmp_path / "out"
+    report = run(card, out, "default", tracks_only=True, options={"field_of_view": 58})
+    assert counts(report) == (2, 0, 0, 0)
+    found = {record["camera"]: record for record in check_whole(out, done=2, failed=0).values()}
+    assert found["front"]["frames"] == FRAMES * SEGMENTS
+    assert found["rear"]["frames"] == FRAMES * 2
+
+    rows = [(frame, row) for frame, number in enumerate(order) for row in scenes[number].truth]
+    truth = FrameBoxes(
+        [frame for frame, _ in rows],
+        [row.track for _, row in rows],
+        [row.box for _, row in rows],
+        ignore=np.array([row.hard_to_see for _, row in rows], bool),
+    )
+    tracks = read_labels(out / found["front"]["outputs"]["tracks"])
+    scores = evaluate_tracks(tracks, truth, frames=range(len(order)))
+    # The same identities before and after each of the eleven cuts.
+    assert (scores.id_switches, scores.fragmentations) == (0, 0)
+    assert len(set(tracks.tracks.tolist())) == scores.tracks == found["front"]["tracks"] == 3
+    assert scores.f1 > 0.99

@@ -1,0 +1,182 @@
+"""Batches that read from and write to storage other than folders."""
+
+import json
+import os
+import signal
+import threading
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from tests.drive.batch_helpers import check_whole, counts, run
+from tests.drive.object_store import PORT, SITE, ObjectStore
+from vehicle_detection import batch_status
+from vehicle_detection.drive import batch_plan as plan
+from vehicle_detection.drive.batch_plan import list_videos
+from vehicle_detection.drive.batch_store import open_store
+from vehicle_detection.errors import InvalidInputError, OutputError, TransientVideoError
+
+pytestmark = pytest.mark.usefixtures("private_scratch")
+
+fsspec = pytest.importorskip("fsspec")
+
+
+def test_remote_sources_are_listed():
+    for name in ("a.mp4", "b.MP4", "c.txt"):
+        with fsspec.open(f"memory://fleet/day/{name}", "wb") as file:
+            file.write(b"x")
+    expected = ["memory://fleet/day/a.mp4", "memory://fleet/day/b.MP4"]
+    for source in ("memory://fleet/day/*", "memory://fleet"):
+        assert list(list_videos([source])) == expected
+
+
+def test_files_of_a_server_are_listed_with_its_name(monkeypatch):
+    files = {"/cards/a.mp4": {"type": "file", "size": 3}, "/cards/note.txt": {"type": "file", "size": 1}}
+    server = SimpleNamespace(
+        invalidate_cache=lambda: None, isdir=lambda path: True, find=lambda path, detail: files
+    )
+    monkeypatch.setattr(plan, "open_filesystem", lambda url: (server, "/cards"))  # as that of FTP
+    assert list(list_videos(["ftp://anna:word@nas/cards/"])) == ["ftp://anna:word@nas/cards/a.mp4"]
+
+
+@pytest.fixture
+def bucket(monkeypatch, tmp_path):
+    """An object store of which every third request fails, also in processes that a test starts."""
+    fsspec.register_implementation("loopback", "tests.drive.object_store.LoopbackFileSystem", clobber=True)
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(SITE)
+    path = [str(tmp_path / "site"), *filter(None, [os.environ.get("PYTHONPATH")])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
+    monkeypatch.setattr("vehicle_detection.video.remote._RETRY_DELAYS", (0, 0))
+    with ObjectStore() as store:
+        monkeypatch.setenv(PORT, str(store.server_address[1]))
+        thread = threading.Thread(target=store.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        yield store
+        store.shutdown()
+        thread.join()
+
+
+def check_objects(bucket, tmp_path, *, done, failed):
+    """Copy the results from the object store, and check them there."""
+    copy = tmp_path / "copy"
+    for key, data in bucket.objects.items():
+        if key.startswith("results/"):
+            path = copy / key.removeprefix("results/")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+    return check_whole(copy, done=done, failed=failed)
+
+
+def test_results_in_an_object_store_that_fails_every_third_request(clip, model, tmp_path, bucket):
+    for name in ("20260131_081500_F", "20260131_093000_R"):
+        bucket.objects[f"cam/{name}.mp4"] = clip.read_bytes()
+    bucket.objects["cam/20260131_103000_F.mp4"] = clip.read_bytes()[:3000]
+    options = {"sources": "loopback://cam/*.mp4", "out": "loopback://results", "model": model}
+    assert counts(run(**options)) == (2, 1, 0, 0)
+    found = check_objects(bucket, tmp_path, done=2, failed=1)
+    assert {(each["camera"], each["date"]) for each in found.values()} == {
+        ("front", "2026-01-31"), ("rear", "2026-01-31")
+    }  # fmt: skip
+    assert (tmp_path / "copy" / "videos" / "date=2026-01-31" / "camera=rear").is_dir()
+    # Nothing is done twice; a changed object is done again, and its old results are gone.
+    del bucket.written[:]
+    assert counts(run(**options)) == (0, 0, 0, 3)
+    assert not bucket.written
+    bucket.objects["cam/20260131_093000_R.mp4"] += b"\0" * 8
+    assert counts(run(**options)) == (1, 0, 0, 2)
+    status = batch_status("loopback://results")
+    assert (status.done, status.failed, status.frames) == (2, 1, 24)
+    assert len([key for key in bucket.objects if key.startswith("results/tracks")]) == 2
+    assert not list((tmp_path / "scratch").iterdir())
+
+
+def test_an_object_store_that_does_not_answer(clip, model, tmp_path, bucket, monkeypatch):
+    bucket.fails = lambda *_: True
+    with pytest.raises(OutputError, match=r"loopback://results/records cannot be listed \(.* 503\); check"):
+        run(clip, "loopback://results", model)
+    # Only the records answer: the next run repeats the trip.
+    bucket.fails = lambda *_: False
+    monkeypatch.setattr("tests.drive.object_store.LoopbackFileSystem.put_file", refuse)
+    report = run(clip, "loopback://results", model)
+    assert counts(report) == (0, 0, 1, 0)
+    assert "cannot be written (no answer)" in next(iter(report.messages.values()))
+
+
+def refuse(*_, **__):
+    raise ConnectionResetError("no answer")
+
+
+def test_a_killed_batch_with_workers_and_an_object_store(many, model, tmp_path, bucket, start_batch):
+    words = (many, "loopback://results", model, "--tracks-only")
+    process = start_batch(*words)
+    deadline = time.monotonic() + 300
+    while sum(key.startswith("results/records/") for key in bucket.written) < 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()  # until its workers have ended
+    before = {key: json.loads(data)["started"] for key, data in bucket.objects.items() if "/records/" in key}
+    process = start_batch(*words)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    found = check_objects(bucket, tmp_path, done=9, failed=1)
+    started = {f"results/records/{key}.json": each["started"] for key, each in found.items()}
+    assert before.items() <= started.items(), "a trip was done twice"
+
+
+def test_a_store_is_the_same_for_a_folder_and_a_url(tmp_path, bucket):
+    file = tmp_path / "file"
+    file.write_bytes(b"whole")
+    for out in (tmp_path / "out", (tmp_path / "o u t").as_uri(), "memory://store/a", "loopback://store/a"):
+        opened = open_store(out, create=True)
+        assert not opened.exists("tracks/x")
+        assert opened.read("tracks/x") is None
+        assert opened.list_files("tracks") == []
+        opened.publish(file, "tracks/day/ab-1.txt")
+        opened.write("tracks/day/cd-2.txt", b"small")
+        opened.write("tracks/day/cd-2.txt", b"smaller")
+        assert sorted(opened.list_files("tracks")) == ["tracks/day/ab-1.txt", "tracks/day/cd-2.txt"]
+        assert opened.list_files("tracks/day", "ab-") == ["tracks/day/ab-1.txt"]
+        paths = ["tracks/day/ab-1.txt", "tracks/missing", "tracks/day/cd-2.txt"]
+        assert dict(opened.read_many(paths)) == {paths[0]: b"whole", paths[2]: b"smaller"}
+        assert dict(opened.read_many([])) == {}
+        opened.remove("tracks/day/ab-1.txt")
+        opened.remove("tracks/missing")
+        assert opened.list_files("tracks") == ["tracks/day/cd-2.txt"]
+        with opened.lock("ab") as locked:
+            assert locked
+
+
+def test_passwords_are_neither_stored_nor_printed(clip, model, tmp_path, bucket):
+    """The user and password of sources and of the output, in records, errors and the summary."""
+    bucket.fails = lambda *_: False
+    bucket.objects["cam/drive.mp4"] = clip.read_bytes()
+    sources = ["loopback://anna:pa@ss@cam/drive.mp4", "loopback://anna:pa@ss@cam/missing.mp4"]
+    out = "loopback://bob:word@results"
+    report = run(sources, out, model, tracks_only=True)
+    assert counts(report) == (1, 1, 0, 0)
+    assert dict(report.messages) == {
+        "loopback://***@cam/missing.mp4": (
+            "source loopback://***@cam/missing.mp4 does not exist; check the URL"
+        )
+    }
+    stored = b"".join(data for key, data in bucket.objects.items() if key.startswith("results/"))
+    for secret in (b"anna", b"ss@", b"bob", b"word"):
+        assert secret not in stored
+    # A new password changes nothing.
+    changed = [source.replace("pa@ss", "new") for source in sources]
+    assert counts(run(changed, out, model, tracks_only=True)) == (0, 0, 0, 2)
+    bucket.fails = lambda *_: True
+    with pytest.raises(OutputError, match=r"^loopback://\*\*\*@results/records cannot be listed"):
+        batch_status(out)
+    with pytest.raises(TransientVideoError, match=r"^loopback://\*\*\*@cam cannot be listed"):
+        list_videos(["loopback://anna:pa@ss@cam"])
+
+
+def test_a_folder_that_cannot_be_written(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    with pytest.raises(InvalidInputError, match="cannot be written; change its permissions"):
+        open_store(tmp_path, create=True)
+    assert open_store(tmp_path).name == str(tmp_path)

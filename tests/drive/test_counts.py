@@ -1,0 +1,41 @@
+"""Counts by minute."""
+
+import dataclasses
+
+import pytest
+
+from tests.drive.report_helpers import track
+from vehicle_detection import Event, TrackLog, count_vehicles
+from vehicle_detection.errors import InvalidInputError
+
+
+def event(kind, frame, number=1):
+    return Event(
+        kind=kind, track_id=number, frame=frame, start_frame=frame, end_frame=frame, time_s=frame / 2
+    )
+
+
+def test_counts_are_the_sums_of_their_minutes():
+    log = TrackLog()
+    for frame in range(290):  # 145 s
+        log.add(frame, None, [track(number) for number in range(1, 2 + (frame >= 120))])
+    events = [event("met", 10), event("met", 130), event("overtaken", 119), event("overtaking", 289)]
+    events += [event("passed", 240), event("cut_in", 20)]
+    counts = count_vehicles(events, log, fps=2)
+    assert [(minute.start_s, minute.seconds) for minute in counts.minutes] == [(0, 60), (60, 60), (120, 25)]
+    assert [minute.met for minute in counts.minutes] == [1, 1, 0]
+    assert [minute.overtaken for minute in counts.minutes] == [1, 0, 0]
+    assert [minute.mean_in_view for minute in counts.minutes] == [1, 2, 2]
+    for name in ("met", "overtaken", "overtaking", "passed", "seconds"):
+        assert sum(getattr(minute, name) for minute in counts.minutes) == getattr(counts.total, name)
+    assert (counts.vehicles, counts.total.max_in_view) == (2, 2)
+    assert counts.summary().startswith(
+        "overtook 1 vehicle, was overtaken by 1, met 2 oncoming, passed 1 other; 1.6 vehicles in view"
+    )
+
+
+def test_an_empty_drive_has_no_minutes():
+    counts = count_vehicles([], TrackLog(), fps=25)
+    assert (counts.minutes, dataclasses.astuple(counts.total)) == ((), (0, 0, 0, 0, 0, 0, 0, 0))
+    with pytest.raises(InvalidInputError, match="fps must be a number, greater than 0"):
+        count_vehicles([], TrackLog(), fps=0)

@@ -1,0 +1,66 @@
+"""Files of events, and clips."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from tests.video.clips import write_clip
+from vehicle_detection import Event, cut_clips, probe_video, write_events
+from vehicle_detection.drive import EVENT_COLUMNS
+from vehicle_detection.errors import InvalidInputError
+
+EVENTS = [
+    Event(kind="cut_in", track_id=2, frame=20, start_frame=12, end_frame=24, time_s=0.8, side="left",
+          distance_m=12.5, distance_std_m=1.5),
+    Event(kind="met", track_id=3, frame=49, start_frame=44, end_frame=49, time_s=1.96),
+]  # fmt: skip
+
+
+def test_csv_and_json_hold_the_same(tmp_path):
+    table, document = tmp_path / "events.csv", tmp_path / "events.json"
+    assert write_events(EVENTS, table) == write_events(EVENTS, document) == 2
+    with table.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    objects = json.loads(document.read_text())
+    assert tuple(rows[0]) == tuple(objects[0]) == EVENT_COLUMNS
+    assert [Event(**each) for each in objects] == EVENTS
+    assert [
+        {name: "" if value is None else str(value) for name, value in each.items()} for each in objects
+    ] == rows
+
+
+def test_no_events_give_a_header(tmp_path):
+    write_events([], tmp_path / "events.csv")
+    assert (tmp_path / "events.csv").read_text() == ",".join(EVENT_COLUMNS) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("events", "name", "message"),
+    [
+        (EVENTS, "events.txt", "path must end in .csv or .json, got 'events.txt'; write 'events.csv'"),
+        (EVENTS, "none/events.csv", "path needs an existing folder"),
+        ([1], "events.csv", "events must be an Event, got 1; pass what find_events returned"),
+    ],
+)
+def test_bad_files_are_refused(events, name, message, tmp_path):
+    with pytest.raises(InvalidInputError, match=message):
+        write_events(events, tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_clips_show_the_frames_around_each_event(tmp_path, monkeypatch, capsys):
+    video = tmp_path / "found.mp4"
+    write_clip(video, [np.full((64, 96, 3), frame * 4, np.uint8) for frame in range(50)])
+    (tmp_path / "clips").mkdir()
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    first, second = cut_clips(EVENTS, video, tmp_path / "clips", fps=25, margin=0.2, progress=True)
+    assert "2/2" in capsys.readouterr().err
+    assert [first.name, second.name] == ["0000.8s_cut_in_2.mp4", "0002.0s_met_3.mp4"]
+    assert probe_video(first).frames == 12 + 1 + 10
+    assert probe_video(second).frames == 5 + 1 + 5
+    with pytest.raises(InvalidInputError, match=r"folder .* does not exist; create it"):
+        cut_clips(EVENTS, video, tmp_path / "none", fps=25)
+    with pytest.raises(InvalidInputError, match="margin must be a number, at least 0"):
+        cut_clips(EVENTS, video, tmp_path, fps=25, margin=-1)

@@ -1,0 +1,290 @@
+"""Events of simulated drives with known truth."""
+
+import dataclasses
+import functools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.drive.drives import CAMERA, FPS, SHAPE, cut_in_times, log_frames, passing_times, simulate
+from vehicle_detection import Camera, Event, TrackLog, find_events
+from vehicle_detection._common import UNITS
+from vehicle_detection.drive.history import TrackHistory
+from vehicle_detection.drive.motion import estimate_motion
+from vehicle_detection.errors import InvalidInputError
+
+SEEDS = (0, 1, 2)
+simulated = functools.cache(simulate)
+
+
+def events_of(scenario, seed, **options):
+    return find_events(simulated(scenario, seed)[1], fps=FPS, shape=SHAPE, **options)
+
+
+def matches(found, true, *, tolerance=2.5):
+    """Number of true events that are found, each at most once; both are ``(kind, side, time)``."""
+    left = list(true)
+    for kind, side, time in found:
+        near = [each for each in left if each[:2] == (kind, side) and abs(each[2] - time) < tolerance]
+        if near:
+            left.remove(near[0])
+    return len(true) - len(left)
+
+
+def listed(events, *kinds):
+    return [(event.kind, event.side, event.time_s) for event in events if event.kind in kinds]
+
+
+@pytest.mark.parametrize("scenario", ["passing", "cut_in", "crossing"])
+def test_overtakes_and_cut_ins_are_found(scenario):
+    found_count = true_count = correct = 0
+    for seed in SEEDS:
+        traffic, _ = simulated(scenario, seed)
+        sides = {True: "left", False: "right"}
+        true = [
+            ("overtaking" if from_behind else "overtaken", sides[lane < 0], time)
+            for time, from_behind, lane in passing_times(traffic, 10)
+        ]
+        true += [("cut_in", sides[lane < 0], time) for time, lane in cut_in_times(traffic)]
+        found = listed(events_of(scenario, seed), "overtaking", "overtaken", "cut_in", "met", "passed")
+        correct += matches(found, true)
+        found_count, true_count = found_count + len(found), true_count + len(true)
+    assert true_count >= len(SEEDS)
+    assert correct / found_count >= 0.9
+    assert correct / true_count >= 0.9
+
+
+@pytest.mark.parametrize("scenario", ["closing", "highway"])
+def test_steady_traffic_has_no_passing_events(scenario):
+    for seed in SEEDS:
+        assert not listed(events_of(scenario, seed), "overtaking", "overtaken", "cut_in", "passed")
+
+
+def test_oncoming_vehicles_are_met():
+    found_count = 0
+    for seed in SEEDS:
+        traffic, _ = simulated("highway", seed)
+        found = listed(events_of("highway", seed), "met")
+        true = [("met", "left", time) for time, *_ in passing_times(traffic, 12, first=0, oncoming=True)]
+        assert matches(found, true, tolerance=1.5) == len(found)
+        found_count += len(found)
+    assert found_count >= 2, "few of them are tracked, at a relative speed of 50 m/s"
+
+
+def test_time_to_collision_is_within_15_percent_at_3_seconds():
+    errors, normalized = [], []
+    for seed in SEEDS:
+        (vehicle,), log = simulated("closing", seed)
+        motion = estimate_motion(log.histories()[0], fps=FPS, shape=SHAPE, camera=CAMERA)
+        true = np.array([vehicle.distance(time) / -vehicle.relative_speed(time) for time in motion.seconds])
+        near = np.abs(true - 3) < 0.4
+        difference = motion.time_to_collision[near] - true[near]
+        errors += (difference / true[near]).tolist()
+        normalized += (difference / motion.time_to_collision_std[near]).tolist()
+    assert len(errors) > 20
+    assert np.median(np.abs(errors)) < 0.15
+    assert np.mean(np.abs(normalized) < 2) > 0.75, "the stated standard errors are about right"
+
+
+def test_a_vehicle_that_closes_in_is_an_event():
+    for seed in SEEDS:
+        (vehicle,), _ = simulated("closing", seed)
+        first = next(event for event in events_of("closing", seed) if event.ttc_s is not None)
+        times = np.arange(0.5, 4, 0.05)
+        true = [vehicle.distance(time) / -vehicle.relative_speed(time) for time in times]
+        assert first.kind in ("closing", "hard_closing")
+        assert abs(first.time_s - times[np.argmin(true)]) < 1.0
+        assert abs(first.ttc_s - min(true)) < max(0.25 * min(true), 2 * first.ttc_std_s)
+        assert first.closing_mps > 3
+
+
+def test_frames_that_were_not_processed_do_not_change_the_speeds():
+    (_, log), dropped = simulated("closing", 0), TrackLog()
+    number = 0
+    for frame, time, tracks in log_frames("closing", 0):
+        if frame % 2 == 0:
+            dropped.add(number, time, tracks)
+            number += 1
+    whole, half = (find_events(each, fps=FPS, shape=SHAPE) for each in (log, dropped))
+    found, expected = (next(event for event in events if event.ttc_s is not None) for events in (half, whole))
+    assert found.kind == expected.kind
+    assert found.ttc_s == pytest.approx(expected.ttc_s, rel=0.15)
+    assert found.closing_mps == pytest.approx(expected.closing_mps, rel=0.1)
+
+
+def test_the_headway_is_at_the_smallest_stated_distance():
+    log = simulated("closing", 0)[1]
+    (history,) = (each for each in log.histories() if each.id == 1)
+    for event in find_events(log, fps=FPS, shape=SHAPE):
+        if event.kind == "headway" and event.track_id == 1:
+            rows = (history.frames >= event.start_frame) & (history.frames <= event.end_frame)
+            stated = history.columns["distance_m"][rows]
+            assert event.distance_m == pytest.approx(np.nanmin(stated), abs=0.01)
+
+
+def test_headway_in_seconds_needs_the_own_speed():
+    unknown = [event for event in events_of("closing", 0) if event.kind == "headway"]
+    known = [event for event in events_of("closing", 0, own_speed_mps=25) if event.kind == "headway"]
+    assert [event.headway_s for event in unknown] == [None] * len(unknown) != []
+    assert known[0].headway_s == pytest.approx(known[0].distance_m / 25, abs=0.01)
+    stopped = events_of("closing", 0, own_speed_mps=np.zeros(200))
+    assert all(event.headway_s is None for event in stopped)
+
+
+def test_the_own_speed_tells_standing_from_moving_vehicles():
+    slow = next(event for event in events_of("passing", 0) if event.kind == "overtaken")
+    (parked,) = (
+        event
+        for event in events_of("passing", 0, own_speed_mps=slow.closing_mps)
+        if event.track_id == slow.track_id and event.side == slow.side
+    )
+    assert parked.kind == "passed"
+    (oncoming,) = (
+        event for event in events_of("passing", 0, own_speed_mps=0.0) if event.track_id == slow.track_id
+    )
+    assert oncoming.kind == "met"
+
+
+def test_speeds_over_ground_where_the_own_speed_is_known():
+    (vehicle,), _ = simulated("closing", 0)
+    own = np.full(200, 30.0)
+    own[60:] = np.nan
+    for event in events_of("closing", 0, own_speed_mps=own):
+        if event.closing_mps is None or event.frame >= 60:
+            assert event.speed_mps is None
+        else:
+            assert event.speed_mps == pytest.approx(30.0 - event.closing_mps, abs=0.011)
+            true = 30.0 + vehicle.relative_speed(event.time_s)
+            assert abs(event.speed_mps - true) < max(3 * event.closing_std_mps, 2.0)
+    assert any(event.speed_mps is not None for event in events_of("closing", 0, own_speed_mps=own))
+    unknown = events_of("closing", 0, own_speed_mps=np.full(200, np.nan))
+    assert unknown == events_of("closing", 0)
+
+
+def test_an_event_is_described_in_units():
+    event = Event(kind="closest_approach", track_id=3, frame=10, start_frame=10, end_frame=10, time_s=0.4,
+                  distance_m=8.0, distance_std_m=1.0)  # fmt: skip
+    text = "vehicle 3 closest approach, distance 26.2 ± 3.3 ft"
+    assert event.text(UNITS["imperial"], with_time=False) == text
+    assert event.text(UNITS["imperial"]) == f"0.4 s: {text}"
+
+
+def test_what_is_stated_is_known_and_in_order():
+    for scenario in ("passing", "cut_in"):
+        log, events = simulated(scenario, 1)[1], events_of(scenario, 1)
+        frames = {track.id: track.frames.tolist() for track in log.histories()}
+        assert [event.frame for event in events] == sorted(event.frame for event in events)
+        for event in events:
+            assert event.start_frame <= event.frame <= event.end_frame
+            assert {event.start_frame, event.frame, event.end_frame} <= set(frames[event.track_id])
+            assert event.time_s == pytest.approx(event.frame / FPS, abs=1e-3)
+            for name in ("distance_m", "headway_s", "ttc_s"):
+                value, std = getattr(event, name), getattr(event, name.replace("_", "_std_"))
+                assert (value is None) == (std is None)
+                assert value is None or 0 < std <= 0.31 * value
+            assert f"vehicle {event.track_id}" in str(event)
+
+
+def test_the_camera_changing_lanes_is_no_cut_in():
+    log = simulated("cut_in", 0)[1]
+    (event,) = listed(find_events(log, fps=FPS, shape=SHAPE), "cut_in")
+    mover = next(track for track in log.histories() if any(e.track_id == track.id for e in
+                 find_events(log, fps=FPS, shape=SHAPE) if e.kind == "cut_in"))  # fmt: skip
+    shift = np.array([200.0, 0, 200, 0]) * (1 if event[1] == "right" else -1)
+    boxes = mover.boxes + shift
+    columns = {**mover.columns, **dict(zip(("x1", "y1", "x2", "y2"), boxes.T))}
+    companion = dataclasses.replace(mover, id=99, columns=columns)
+    found = find_events([mover, companion], fps=FPS, shape=SHAPE)
+    assert not listed(found, "cut_in")
+
+
+@given(seed=st.integers(0, 10_000), known=st.booleans(), speed=st.sampled_from([None, 20.0]))
+def test_any_track_gives_consistent_events(seed, known, speed):
+    rng = np.random.default_rng(seed)
+    frames = np.flatnonzero(rng.random(80) > 0.3)
+    steps = rng.normal(0, 12, (len(frames), 4)).cumsum(axis=0)
+    first = rng.uniform(-100, 700, 2)
+    x, y = first[0] + steps[:, 0], first[1] + steps[:, 1]
+    sides = 20 * np.exp(np.abs(steps[:, 2:]) / 30)
+    boxes = np.clip(np.stack([x, y, x + sides[:, 0], y + sides[:, 1]], axis=1), 0, [1280, 720, 1280, 720])
+    columns = dict(zip(("x1", "y1", "x2", "y2"), boxes.T))
+    distance = 2000 / sides[:, 1] if known else np.full(len(frames), np.nan)
+    columns |= {"distance_m": distance, "distance_std_m": 0.1 * distance}
+    track = TrackHistory(1, frames, columns)
+    for event in find_events([track], fps=FPS, shape=SHAPE, own_speed_mps=speed):
+        assert event.start_frame <= event.frame <= event.end_frame
+        assert event.ttc_s is None or event.ttc_s > 0
+        assert event.distance_m is None or event.distance_m > 0
+        assert all(math.isfinite(value) for value in vars(event).values() if isinstance(value, float))
+
+
+def test_a_camera_of_another_size_is_scaled_or_refused():
+    log = simulated("cut_in", 0)[1]
+    large = Camera.for_frame((2 * SHAPE[0], 2 * SHAPE[1]))
+    same = find_events(log, fps=FPS, shape=SHAPE, camera=Camera.for_frame(SHAPE))
+    assert find_events(log, fps=FPS, shape=SHAPE, camera=large) == same
+    with pytest.raises(InvalidInputError, match="camera must be one for frames of"):
+        find_events(log, fps=FPS, shape=(500, 500), camera=large)
+
+
+def test_no_tracks_give_no_events():
+    assert find_events(TrackLog(), fps=25, shape=(720, 1280)) == ()
+    log = TrackLog()
+    log.add(0, None, [])
+    assert find_events(log, fps=25, shape=(720, 1280)) == ()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fps": 0}, "fps must be a number, greater than 0"),
+        ({"shape": (720,)}, r"shape must be \(height, width"),
+        ({"camera": 1.2}, "camera must be a Camera"),
+        ({"own_speed_mps": -1.0}, "own_speed_mps must be a number of at least 0, or one for each frame"),
+        ({"own_speed_mps": [1.0]}, "own_speed_mps must be a number of at least 0, or one for each frame"),
+        ({"own_speed_mps": "fast"}, "own_speed_mps must be a number of at least 0"),
+    ],
+)
+def test_bad_arguments_are_refused(options, message):
+    log = simulated("closing", 0)[1]
+    with pytest.raises(InvalidInputError, match=message):
+        find_events(log, **({"fps": FPS, "shape": SHAPE} | options))
+
+
+def test_events_are_values():
+    event = Event(kind="met", track_id=1, frame=10, start_frame=5, end_frame=10, time_s=0.4, side="left")
+    assert str(event) == "0.4 s: vehicle 1 met (oncoming), on the left"
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        event.frame = 3
+
+
+def test_no_vehicle_is_followed_while_it_is_not_seen():
+    def box(frame):
+        return [620 - 0.1 * (frame % 2), 380, 660, 420]
+
+    frames = np.array([*range(8), *range(95, 103)])
+    boxes = np.array([box(frame) for frame in frames], float)
+    known = {"distance_m": 20.0, "distance_std_m": 1.0}
+    columns = {**dict(zip(("x1", "y1", "x2", "y2"), boxes.T))}
+    blank = simulated("highway", 0)[1].histories()[0].columns
+    columns |= {name: np.full(len(frames), known.get(name, np.nan)) for name in blank if name not in columns}
+    found = find_events([TrackHistory(1, frames, columns)], fps=25, shape=SHAPE)
+    assert not listed(found, "headway")
+
+
+def test_distances_of_a_fisheye_lens():
+    """A car in the next lane, whose box at the border of the image is far from that of a pinhole camera."""
+    camera = dataclasses.replace(CAMERA, fisheye=True)
+    (history,) = simulated("closing", 0)[1].histories()[:1]
+    moved = {**history.columns, "x1": history.columns["x1"] + 200, "x2": history.columns["x2"] + 200}
+    far = dataclasses.replace(history, columns={**moved, "distance_m": np.full(len(history.frames), np.nan)})
+    boxes = camera.rectify_boxes(far.boxes, SHAPE)
+    plain = dataclasses.replace(far, columns={**far.columns, **dict(zip(("x1", "y1", "x2", "y2"), boxes.T))})
+    found = estimate_motion(far, fps=FPS, shape=SHAPE, camera=camera)
+    expected = estimate_motion(plain, fps=FPS, shape=SHAPE, camera=CAMERA)
+    inside = boxes[:, 2] < 1200
+    assert inside.sum() > 20
+    np.testing.assert_allclose(found.distance[inside], expected.distance[inside])

@@ -1,0 +1,118 @@
+"""The data that a report keeps of a run."""
+
+import math
+import pickle
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.drive.report_helpers import track
+from vehicle_detection import OwnSpeed
+from vehicle_detection.drive.history import TrackHistory, TrackLog, bin_means
+
+PRESENCE = st.lists(st.sets(st.integers(1, 4)), max_size=40)
+
+
+def log_of(frames):
+    """Log of the ids of the tracks in each frame."""
+    log = TrackLog()
+    for index, numbers in enumerate(frames):
+        log.add(index, None, [track(number, distance=index + number) for number in sorted(numbers)])
+    return log
+
+
+@given(PRESENCE)
+def test_the_log_keeps_the_frames_and_values_of_each_track(frames):
+    log = log_of(frames)
+    assert list(log.counts) == [len(numbers) for numbers in frames]
+    histories = log.histories()
+    assert {each.id for each in histories} == set().union(*frames)
+    for each in histories:
+        assert each.frames.tolist() == [index for index, numbers in enumerate(frames) if each.id in numbers]
+        assert each.columns["distance_m"].tolist() == [index + each.id for index in each.frames]
+        spans = each.spans()
+        assert [index for start, stop in spans for index in range(start, stop)] == each.frames.tolist()
+        assert all(stop < start for (_, stop), (start, _) in pairwise(spans))
+    order = [(each.first, each.id) for each in histories]
+    assert order == sorted(order)
+
+
+def test_a_log_can_be_pickled():
+    log = log_of([{1}, {1, 2}])
+    copied = pickle.loads(pickle.dumps(log))
+    copied.add(2, None, [track(3)])
+    assert [each.id for each in copied.histories()] == [1, 2, 3]
+    assert [each.id for each in log.histories()] == [1, 2]
+
+
+@given(st.sets(st.integers(0, 60), min_size=1), st.integers(1, 10), st.data())
+def test_bins_hold_the_means_of_known_values(frames, width, data):
+    frames = np.array(sorted(frames))
+    size = {"min_size": len(frames), "max_size": len(frames)}
+    values = np.array(data.draw(st.lists(st.floats(-100, 100) | st.just(math.nan), **size)))
+    bins, means = bin_means(frames, values, width)
+    groups = {}
+    for frame, value in zip(frames, values):
+        if not math.isnan(value):
+            groups.setdefault(frame // width, []).append(value)
+    assert bins.tolist() == sorted(groups)
+    assert means == pytest.approx([np.mean(groups[number]) for number in sorted(groups)], abs=1e-9)
+
+
+def history(frames, distances):
+    columns = {name: np.full(len(frames), math.nan) for name in ("speed_mps", "speed_std_mps", "confidence")}
+    columns["distance_m"] = np.array(distances, float)
+    columns["distance_std_m"] = np.ones(len(frames))
+    return TrackHistory(1, np.array(frames, np.int64), columns)
+
+
+def test_an_outlier_is_not_the_closest_approach():
+    distances = [30.0 - index / 10 for index in range(100)]
+    distances[3] = 1.0
+    approach = history(range(100), distances).closest_approach(25.0)
+    assert approach.distance_m == pytest.approx(20.5, abs=0.2)
+    assert approach.frame > 90
+    assert approach.std_m == 1.0
+
+
+def test_the_closest_approach_of_few_known_distances():
+    assert history([5], [12.0]).closest_approach(25.0) == (5, 12.0, 1.0)
+    assert history([5, 6], [math.nan, 12.0]).closest_approach(0.1).frame == 6
+    assert history([5], [math.nan]).closest_approach(25.0) is None
+
+
+def test_frames_that_a_live_source_dropped():
+    log = TrackLog()
+    for frame in (0, 1, 5, 6):
+        log.add(frame, frame / 10, [track(1)] if frame < 6 else [])
+    assert list(log.counts) == [1, 1, 1, 1, 1, 1, 0]
+    assert log.histories()[0].frames.tolist() == [0, 1, 5]
+
+
+def test_the_closest_approach_does_not_depend_on_the_unit():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        distances = rng.uniform(5, 9, 40).round(2)
+        meters, feet = (history(range(40), distances * unit).closest_approach(25) for unit in (1, 1 / 0.3048))
+        assert meters.frame == feet.frame
+
+
+def test_times_of_frames_that_are_not_evenly_spaced():
+    log = TrackLog()
+    for frame, time in enumerate((5.0, 5.1, None, 5.5)):
+        log.add(frame, time, [track(1)])
+    assert log.histories()[0].times.tolist() == pytest.approx([5.0, 5.1, 5.3, 5.5])
+    speed = OwnSpeed(np.array([5.0, 6.0]), np.array([10.0, 20.0]))
+    assert log.own_speeds(speed, 25).tolist() == pytest.approx([10, 11, 13, 15])
+    repeated = TrackLog()
+    for frame, time in enumerate((1.0, 1.1, 1.1, 1.3)):
+        repeated.add(frame, time, [track(1)])
+    assert repeated.histories()[0].times.tolist() == pytest.approx([1.0, 1.1, 1.2, 1.3])
+    for times in ((1.0, 1.0), (1.0, 0.5), (None, 1.0), (None, None)):
+        other = TrackLog()
+        for frame, time in enumerate(times):
+            other.add(frame, time, [track(1)])
+        assert other.histories()[0].times is None

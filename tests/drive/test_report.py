@@ -1,0 +1,140 @@
+"""Files: the page, and a video embedded in it or linked from it."""
+
+import base64
+import math
+from urllib.parse import unquote
+
+import pytest
+
+from tests.drive.report_helpers import FRAMES, StrictParser, track, video_report, write_report
+from vehicle_detection.drive import ReportWriter
+from vehicle_detection.drive import report as writer
+from vehicle_detection.drive import report_page as page
+from vehicle_detection.errors import InvalidInputError
+
+
+def test_a_large_video_is_linked(tmp_path):
+    folder = tmp_path / "a #1 & 50%"
+    (folder / "videos").mkdir(parents=True)
+    (folder / "pages").mkdir()
+    video = folder / "videos" / "my video: 1.mp4"
+    video.write_bytes(b"\0" * 2_000_000)
+    linked = write_report(folder / "pages", FRAMES, video=video, embed_limit=1_999_999)
+    (source,) = StrictParser(linked).all("source")
+    assert source["src"] == "../videos/my%20video%3A%201.mp4"
+    assert (folder / "pages" / unquote(source["src"])).samefile(video)
+    assert "The video of 2 MB is too large to be part of this page" in linked
+    embedded = write_report(folder / "pages", FRAMES, video=video, embed_limit=2_000_000)
+    assert "too large" not in embedded
+    assert len(embedded) > 2_000_000 * 4 / 3
+
+
+@pytest.mark.parametrize("size", range(9))
+def test_a_video_is_embedded_in_pieces(tmp_path, monkeypatch, size):
+    monkeypatch.setattr(page, "_CHUNK", 3)
+    video = tmp_path / "video.mp4"
+    video.write_bytes(bytes(range(size)))
+    (source,) = StrictParser(write_report(tmp_path, FRAMES, video=video)).all("source")
+    assert base64.b64decode(source["src"].split(",")[1], validate=True) == video.read_bytes()
+
+
+def test_no_piece_of_a_page_holds_the_whole_video(tmp_path, monkeypatch):
+    assert page._CHUNK % 3 == 0
+    monkeypatch.setattr(page, "_CHUNK", 3000)
+    video = tmp_path / "video.mp4"
+    video.write_bytes(bytes(90_000))
+    sizes = []
+    render = writer.render_page
+    monkeypatch.setattr(
+        writer,
+        "render_page",
+        lambda *args, **options: (sizes.append(len(piece)) or piece for piece in render(*args, **options)),
+    )
+    write_report(tmp_path, FRAMES, video=video)
+    assert sizes.count(4000) >= 30
+    assert max(sizes) < 20_000
+
+
+def test_matroska_comes_with_a_note(tmp_path):
+    video = tmp_path / "video.MKV"
+    video.write_bytes(b"video")
+    text = write_report(tmp_path, FRAMES, video=video)
+    assert 'type="video/x-matroska"' in text
+    assert "Not every browser plays Matroska" in text
+
+
+def test_rejects_paths_that_cannot_be_written(tmp_path):
+    with pytest.raises(InvalidInputError, match=r"path must be a file name, got 3; pass a path"):
+        ReportWriter(3)
+    with pytest.raises(InvalidInputError, match=r"video must be a file name, got 3"):
+        ReportWriter(tmp_path / "report.html", video=3)
+    with pytest.raises(InvalidInputError, match=r"source must be a file name, got \['a'\]"):
+        ReportWriter(tmp_path / "report.html", source=["a"])
+    with pytest.raises(
+        InvalidInputError, match=r"path must end in .html or .htm, got 'report.pdf'; write 'report.html'"
+    ):
+        ReportWriter(tmp_path / "report.pdf")
+    with pytest.raises(InvalidInputError, match="path needs an existing folder"):
+        ReportWriter(tmp_path / "missing" / "report.html")
+    (tmp_path / "folder.html").mkdir()
+    with pytest.raises(InvalidInputError, match="path must be a file, got the folder"):
+        ReportWriter(tmp_path / "folder.html")
+    target = tmp_path / "page.html"
+    with pytest.raises(InvalidInputError, match=r"is also the video; choose another name"):
+        ReportWriter(target, video=tmp_path / "." / "page.html")
+    with pytest.raises(InvalidInputError, match=r"is also the source; choose another name"):
+        ReportWriter(target, source=target)
+    with pytest.raises(InvalidInputError, match="embed_limit must be an integer at least 0"):
+        ReportWriter(target, embed_limit=-1)
+    assert list(tmp_path.iterdir()) == [tmp_path / "folder.html"]
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        ((0.5, 0.0, []), "index must be an integer at least 0"),
+        ((0, math.nan, []), "time must be a number"),
+        ((0, 0.0, None), r"tracks must be Track objects, got None; pass result.tracks"),
+        ((0, 0.0, "abc"), "tracks must be Track objects, got 'abc'"),
+        ((0, 0.0, [(1, 2)]), r"tracks must be Track objects, got \(1, 2\) \(tuple\)"),
+        ((0, 0.0, [track(1), track(1)]), "tracks must have unique ids, got 1 twice in one frame"),
+        ((0, 0.0, [track(-1)]), "track.id must be an integer at least 0; got -1"),
+        (
+            (0, 0.0, [track(1, distance="far")]),
+            r"track.distance_m must be a number or None, got 'far'",
+        ),
+        ((0, 0.0, [track(1, speed=True)]), "track.speed_mps must be a number or None, got True"),
+    ],
+)
+def test_rejects_malformed_frames(tmp_path, frame, message):
+    report = ReportWriter(tmp_path / "report.html")
+    with pytest.raises(InvalidInputError, match=message):
+        report.write(*frame)
+    # Nothing of the rejected frame is kept: the right one can still be written.
+    report.write(0, 0.0, [track(1)])
+    with pytest.raises(InvalidInputError, match="index must be at least 1, as frames are added in order"):
+        report.write(0, 0.0, [])
+
+
+def test_an_earlier_page_stays_if_a_new_one_fails(tmp_path, monkeypatch):
+    video = tmp_path / "video.mp4"
+    video.write_bytes(b"video")
+    before = write_report(tmp_path, FRAMES)
+    report = ReportWriter(tmp_path / "report.html", video=tmp_path / "missing.mp4")
+    report.write(0, 0.0, [])
+    with pytest.raises(
+        InvalidInputError, match=r"missing.mp4 does not exist; call finish after process_video"
+    ):
+        report.finish(video_report(1))
+    with pytest.raises(InvalidInputError, match="report must be a VideoReport, got None"):
+        report.finish(None)
+
+    def fail(*_):
+        raise OSError("the disk is full")
+
+    monkeypatch.setattr(page.VideoEmbed, "base64_chunks", fail)
+    report = ReportWriter(tmp_path / "report.html", video=video)
+    with pytest.raises(OSError, match="the disk is full"):
+        report.finish(video_report(1))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "video.mp4"]
+    assert (tmp_path / "report.html").read_text(encoding="utf-8") == before

@@ -1,0 +1,213 @@
+"""The report page in headless Chromium, controlled by chromedriver over HTTP."""
+
+import itertools
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tools.browser import PHONE, Browser
+from vehicle_detection.annotator import draw_tracks
+from vehicle_detection.cli.demo import draw_clip
+from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.drive import ReportWriter
+from vehicle_detection.scenes import render_drive
+from vehicle_detection.tracking import Track
+from vehicle_detection.video import process_video
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="process groups and file names of POSIX")
+
+FRAMES, FPS = 50, 25
+SOURCE, TARGET = 'a <b>&amp; "c" #1.mp4', "50% <i> 'd' #2?.mp4"
+VIDEO = "document.querySelector('video')"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    try:
+        browser = Browser(tmp_path_factory.mktemp("browser"))
+    except FileNotFoundError as error:
+        pytest.skip(str(error))
+    yield browser
+    browser.close()
+
+
+class ScriptedDetector:
+    """A detector with one vehicle in all frames and another in frames 20 to 39."""
+
+    def reset(self, *, fps):
+        self.index = -1
+
+    def search(self, frame):
+        return None
+
+    def track(self, found, *, time):
+        self.index += 1
+        box = np.array([100.0 + self.index, 120, 180 + self.index, 180])
+        first = Track(
+            id=1,
+            box=box,
+            score=1.5,
+            state="confirmed",
+            shown=True,
+            age=1.0,
+            misses=0,
+            time_since_update=0.0,
+            velocity=(25.0, 0.0),
+            distance_m=20 + self.index / 10,
+            distance_std_m=2.0 if self.index < 45 else 8.0,
+            speed_mps=2.5,
+            speed_std_mps=0.5,
+        )
+        second = replace(first, id=2, box=box + 150, distance_m=None, speed_mps=-1.0)
+        tracks = (first, second) if 20 <= self.index < 40 else (first,)
+        return SimpleNamespace(index=self.index, time=time, tracks=tracks, seconds={"search": 0.01})
+
+    def annotate(self, frame, result):
+        return draw_tracks(frame, result.tracks)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a folder with two pages, one with an embedded and one with a linked video."""
+    folder = tmp_path_factory.mktemp("a #1 folder & 100%")
+    (folder / "pages").mkdir()
+    drive = render_drive(frames=FRAMES, fps=FPS, shape=(270, 480), scenario="empty")
+    draw_clip(drive, folder / SOURCE, folder / "labels.csv")
+    with VehicleDetector(n_jobs=1) as detector:
+        about = {"video": folder / TARGET, "source": folder / SOURCE, "detector": detector}
+        writers = [
+            ReportWriter(folder / "embedded.html", **about),
+            ReportWriter(folder / "pages" / "linked.html", **about, embed_limit=1000),
+        ]
+        report = process_video(
+            folder / SOURCE,
+            folder / TARGET,
+            ScriptedDetector(),
+            progress=False,
+            on_result=lambda result: [write(result) for write in writers],
+        )
+        for write in writers:
+            write.finish(report)
+    return folder
+
+
+@pytest.fixture
+def embedded(folder):
+    return folder / "embedded.html"
+
+
+def current_frame(browser):
+    browser.wait_until(f"!{VIDEO}.seeking")
+    return int(browser.run(f"{VIDEO}.currentTime") * FPS)
+
+
+@pytest.mark.parametrize("name", ["embedded.html", "pages/linked.html"])
+def test_the_video_plays_and_nothing_else_is_loaded(browser, folder, name):
+    browser.open(folder / name)
+    assert browser.run(f"[{VIDEO}.videoWidth, {VIDEO}.videoHeight]") == [480, 270]
+    assert browser.run(f"{VIDEO}.duration") == pytest.approx(FRAMES / FPS, abs=0.05)
+    browser.run(f"{VIDEO}.muted = true, {VIDEO}.play()")
+    browser.wait_until(f"{VIDEO}.currentTime > 0.3")
+    browser.wait_until(f"{VIDEO}.ended")
+    # The playhead has moved along.
+    browser.wait_until("document.querySelector('.playhead').getAttribute('x1') === '99%'")
+    assert browser.log("browser") == []
+    schemes = {url.split(":")[0] for url in browser.requests()}
+    assert "file" in schemes
+    assert schemes <= {"file", "data", "blob"}
+    assert browser.run(f"{VIDEO}.currentSrc").startswith("file:" if "linked" in name else "blob:")
+
+
+@pytest.mark.parametrize("name", ["embedded.html", "pages/linked.html"])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_fits_a_phone(browser, folder, name, scheme):
+    browser.open(folder / name, size=PHONE, scheme=scheme)
+    browser.run("document.querySelectorAll('details').forEach(each => each.open = true)")
+    assert browser.run("innerWidth") == PHONE["width"]
+    assert browser.run("document.documentElement.scrollWidth") <= PHONE["width"]
+    assert browser.run("document.querySelectorAll('details').length") > 5
+    # The text of charts keeps its size.
+    sizes = browser.run(
+        "[...document.querySelectorAll('svg text')].map(t => t.getBoundingClientRect().height)"
+    )
+    assert min(sizes) >= 10
+
+
+def test_the_page_has_a_light_and_a_dark_scheme(browser, embedded):
+    backgrounds = []
+    for scheme in ("light", "dark"):
+        browser.open(embedded, scheme=scheme)
+        backgrounds.append(browser.run("getComputedStyle(document.body).backgroundColor"))
+    assert backgrounds == ["rgb(255, 255, 255)", "rgb(16, 20, 24)"]
+
+
+def test_bars_and_charts_seek_in_the_video(browser, embedded):
+    browser.open(embedded)
+    browser.click(".bar[data-track='2']")
+    assert current_frame(browser) == 20
+    browser.type(".bar[data-track='1']", "\ue007")  # the enter key
+    assert current_frame(browser) == 0
+    browser.click("td:nth-child(2) button[data-frame='20']")
+    assert current_frame(browser) == 20
+    browser.point("figure:nth-of-type(3) .plot", 0.5, press=True)
+    assert current_frame(browser) == pytest.approx(25, abs=1)
+    assert browser.log("browser") == []
+
+
+def test_hovering_over_a_chart_shows_the_values_there(browser, embedded):
+    browser.open(embedded)
+    assert browser.run("document.querySelector('.readout').textContent") == "0:00.0#1 20 m +9 km/h"
+    browser.point("figure:nth-of-type(4) .plot", 0.609)
+    readout = browser.run("document.querySelector('.readout').textContent")
+    assert readout == "0:01.2#1 23 m +9 km/h#2 \u22124 km/h"
+    assert browser.run("document.querySelectorAll('.cursor.visible').length") == 4
+    assert browser.run("document.querySelector('.cursor').getAttribute('x1')") == "61%"
+    browser.point("figure:nth-of-type(4) .plot", 0.97)
+    assert browser.run("document.querySelector('.readout').textContent") == "0:01.9#1 ~25 m +9 km/h"
+    assert browser.run(f"{VIDEO}.currentTime") == 0
+    browser.point("h1", 0.5)
+    assert browser.run("document.querySelectorAll('.cursor.visible').length") == 0
+    assert browser.run("document.querySelector('.readout').textContent") == "0:00.0#1 20 m +9 km/h"
+    # Hovering over a bar fades the other tracks.
+    browser.point(".bar[data-track='2']", 0.5)
+    assert browser.run("[...document.querySelectorAll('.faded')].every(part => part.dataset.track === '1')")
+    assert browser.run("document.querySelectorAll('.faded').length") == 3
+
+
+def test_file_names_are_text(browser, folder):
+    browser.open(folder / "pages" / "linked.html")
+    assert browser.run("document.title") == f"Vehicles in {SOURCE}"
+    assert browser.run("document.querySelector('h1').textContent") == f"Vehicles in {SOURCE}"
+    assert browser.run("document.querySelector('h1').querySelectorAll(':scope > bdi, bdi *').length") == 1
+    assert browser.run("document.querySelector('.player a').textContent") == TARGET
+
+
+def test_headings_charts_and_controls_have_names(browser, embedded):
+    browser.open(embedded)
+    nodes = browser.command("Accessibility.getFullAXTree")["nodes"]
+    named = {"heading", "image", "button", "region", "Video", "group", "link"}
+    found = [node for node in nodes if not node["ignored"] and node["role"]["value"] in named]
+    inside = ("details", "summary")
+    nameless = [
+        node["role"]["value"]
+        for node in found
+        if not node.get("name", {}).get("value") and node["role"]["value"] not in inside
+    ]
+    assert {node["role"]["value"] for node in found} >= {"heading", "image", "button", "region", "Video"}
+    assert set(nameless) <= {"group"}, nameless  # a <details> is a group without a name of its own
+    heads = browser.run("[...document.querySelectorAll('h1, h2, h3')].map(head => +head.tagName[1])")
+    assert heads[0] == 1
+    assert all(after <= before + 1 for before, after in itertools.pairwise(heads))
+
+
+def test_without_its_script_the_page_still_shows_the_video(browser, embedded):
+    browser.command("Emulation.setScriptExecutionDisabled", value=True)
+    try:
+        browser.open(embedded)
+        assert browser.run(f"{VIDEO}.currentSrc").startswith("data:video/mp4;base64,")
+        assert browser.run(f"{VIDEO}.videoWidth") == 480
+    finally:
+        browser.command("Emulation.setScriptExecutionDisabled", value=False)

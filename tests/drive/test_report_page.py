@@ -1,0 +1,463 @@
+"""The content of the page."""
+
+import base64
+import dataclasses
+import hashlib
+import html
+import json
+import math
+import re
+import sys
+from itertools import combinations
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.drive.report_helpers import (
+    FPS,
+    FRAMES,
+    StrictParser,
+    script_data,
+    track,
+    video_report,
+    write_report,
+)
+from vehicle_detection.camera import Camera
+from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.drawing import TRACK_COLORS
+from vehicle_detection.drive import Event, ReportWriter, TrackPicture
+from vehicle_detection.drive import report_page as page
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.heatmap import HeatParams
+from vehicle_detection.loading import load_model
+from vehicle_detection.svm import load_classifier
+from vehicle_detection.tracking import TrackParams
+
+UNSAFE_NAME = "\"><img src=x onerror=alert(1)>&amp;'</title><script>.mp4"
+
+
+@pytest.fixture
+def video(tmp_path_factory):
+    path = tmp_path_factory.mktemp("video") / "found.mp4"
+    path.write_bytes(bytes(range(256)) * 7)
+    return path
+
+
+class TestPage:
+    def test_is_complete_and_self_contained(self, tmp_path, video):
+        with VehicleDetector(n_jobs=1) as detector:
+            text = write_report(tmp_path, FRAMES, video=video, source="drive.mp4", detector=detector)
+        parsed = StrictParser(text)
+        assert text.startswith("<!DOCTYPE html>\n")
+        assert parsed.all("html") == [{"lang": "en"}]
+        assert parsed.texts["head/title"] == "Vehicles in drive.mp4"
+        (source,) = parsed.all("source")
+        kind, data = source["src"].split(",")
+        assert kind == "data:video/mp4;base64"
+        assert base64.b64decode(data, validate=True) == video.read_bytes()
+        addresses = [
+            value for _, each in parsed.elements for name, value in each.items() if name in ("src", "href")
+        ]
+        assert all(address.startswith("data:") for address in addresses)
+        assert not re.search(r"https?:|url\(|@import|//[a-z]", text.replace(data, "").replace("// ", ""))
+        identifiers = [each["id"] for _, each in parsed.elements if "id" in each]
+        assert len(set(identifiers)) == len(identifiers)
+
+    def test_its_policy_allows_its_own_script_and_style_only(self, tmp_path):
+        text = write_report(tmp_path, FRAMES)
+        (policy,) = [each["content"] for each in StrictParser(text).all("meta") if "http-equiv" in each]
+        rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+        assert rules["default-src"] == "'none'"
+        for element, rule in (("script", "script-src"), ("style", "style-src")):
+            (code,) = re.findall(f"<{element}>(.*?)</{element}>", text, re.DOTALL)
+            digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
+            assert rules[rule] == f"'sha256-{digest}'"
+        # The policy forbids inline styles and event handlers.
+        assert not re.search(r'<[^>]* (style|on\w+)="', text)
+
+    def test_file_names_stay_text(self, tmp_path):
+        (tmp_path / "in").mkdir()
+        name = UNSAFE_NAME.replace("/", "_")
+        video = tmp_path / "in" / (name if sys.platform != "win32" else "found.mp4")
+        video.write_bytes(b"video")
+        text = write_report(tmp_path, FRAMES, source=f"/roads/{name}", video=video, embed_limit=3)
+        parsed = StrictParser(text)
+        assert parsed.all("img") == []
+        assert len(parsed.all("script")) == 2
+        assert parsed.texts["head/title"] == f"Vehicles in {name}"
+        assert parsed.texts["h1/bdi"] == name
+        assert parsed.texts["a/bdi"] == video.name
+
+    @settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(st.text(st.characters(codec="utf-8", exclude_characters="/\\\0\r\n"), min_size=1))
+    def test_any_source_name_is_escaped(self, tmp_path, name):
+        text = write_report(tmp_path, FRAMES[:1], source=f"{name}.mp4")
+        title = re.search(r"<title>(.*?)</title>", text, re.DOTALL)[1]
+        assert not set(title) & set("<>\"'")
+        assert html.unescape(title) == f"Vehicles in {name}.mp4"
+
+    def test_bytes_of_a_file_name_that_are_not_utf8_are_replaced(self, tmp_path):
+        name = b"road \xff.mp4".decode("utf-8", "surrogateescape")
+        assert "Vehicles in road ?.mp4" in write_report(tmp_path, FRAMES, source=name)
+
+    def test_a_url_is_shown_without_its_password(self, tmp_path):
+        text = write_report(tmp_path, FRAMES[:1], source="rtsp://anna:se@cret@camera")
+        assert "Vehicles in ***@camera" in text
+        assert "anna" not in text
+
+    def test_a_run_without_a_video(self, tmp_path):
+        text = write_report(tmp_path, FRAMES)
+        parsed = StrictParser(text)
+        assert parsed.all("video") == []
+        assert "No video was written." in text
+        assert "go to that time in the video" not in text
+        assert parsed.texts["head/title"] == "Vehicles"
+
+    @pytest.mark.parametrize("tracks", [[], [track(1, shown=False)], [track(0, shown=False)] * 2])
+    def test_a_road_without_vehicles(self, tmp_path, tracks):
+        text = write_report(tmp_path, [tracks] * 10)
+        StrictParser(text)
+        assert text.count("No vehicle was shown.") == 2
+        assert json.loads(script_data(text))["tracks"] == []
+
+    def test_vehicles_without_distance_and_speed(self, tmp_path):
+        text = write_report(tmp_path, [[SimpleNamespace(id=7, shown=True)]] * 5)
+        StrictParser(text)
+        assert "No distance is known." in text
+        assert "No relative speed is known." in text
+        assert json.loads(script_data(text))["tracks"][0]["distance"] == [None] * 5
+
+    def test_counts_are_those_of_the_run(self, tmp_path):
+        text = write_report(tmp_path, FRAMES)
+        counts = dict(re.findall(r"<dt>([^<]*)</dt><dd>([^<]*)</dd>", text))
+        assert counts["Vehicles"] == "2"
+        assert counts["Frames"] == "50"
+        assert counts["Length"] == "0:02.0"
+        assert counts["Most at once"] == "2"
+        assert counts["Longest track"] == "#1, 2.0 s"
+        assert counts["Nearest"] == "21 \N{PLUS-MINUS SIGN} 2 m, #1"
+        rows = re.findall(r"<tr>(<th scope=\"row\">.*?)</tr>", text, re.DOTALL)
+        cells = [re.findall(r"<t[hd].*?>(.*?)</t[hd]>", row) for row in rows]
+        assert [re.sub("<.*?>", "", cell) for cell in cells[2]] == [
+            "#2", "0:00.4", "0:00.8", "10", "\N{EN DASH}", "\N{EN DASH}", "100 %",
+        ]  # fmt: skip
+        assert "decode" in text
+        assert "20.00" in text  # milliseconds per frame
+        assert "75.0%" in text
+
+    def test_notices(self, tmp_path):
+        assert '<ul class="notices">' not in write_report(tmp_path, FRAMES)
+        writer = ReportWriter(tmp_path / "report.html", detector=SimpleNamespace(lens_is_known=False))
+        writer.write(0, 0.0, [track(1)])
+        writer.finish(video_report(1, damage="<a>.mp4 is damaged: 3 frames are missing", dropped=2))
+        text = (tmp_path / "report.html").read_text(encoding="utf-8")
+        (notices,) = re.findall(r'<ul class="notices">(.*?)</ul>', text, re.DOTALL)
+        assert re.findall(r"<li>(.*)</li>", notices) == [
+            "&lt;a&gt;.mp4 is damaged: 3 frames are missing.",
+            "2 frames of the live source were dropped.",
+            "The lens is unknown: distances and speeds may be wrong by a factor of 2 or more.",
+        ]
+
+    def test_notices_leave_out_the_folder_of_the_source(self, tmp_path):
+        source = tmp_path / "road" / "drive.mp4"
+        writer = ReportWriter(tmp_path / "report.html", source=source)
+        writer.finish(video_report(0, damage=f"{source} is incomplete"))
+        assert "<li>drive.mp4 is incomplete.</li>" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+    def test_an_unknown_lens_matters_for_distances_only(self, tmp_path):
+        detector = SimpleNamespace(lens_is_known=False)
+        text = write_report(tmp_path, [[track(1, distance=None, speed=None)]], detector=detector)
+        assert "The lens is unknown" not in text
+
+    def test_small_standard_errors_keep_a_decimal(self, tmp_path):
+        text = write_report(tmp_path, [[track(1, distance=5.23, distance_std=0.36)]] * 5)
+        assert "<dd>5.2 \N{PLUS-MINUS SIGN} 0.4 m, #1</dd>" in text
+
+    def test_units(self, tmp_path):
+        frames = [[track(1, distance=30.48, speed=10.0)] for _ in range(5)]
+        text = write_report(tmp_path, frames, units="imperial")
+        assert "100 \N{PLUS-MINUS SIGN} 7 ft, #1" in text
+        assert "Miles per hour relative to the camera" in text
+        data = json.loads(script_data(text))
+        assert data["units"] == ["ft", "mph"]
+        assert (data["tracks"][0]["distance"], data["tracks"][0]["speed"]) == ([100.0] * 5, [22.4] * 5)
+        with pytest.raises(InvalidInputError, match="units must be one of 'metric', 'imperial'; got 'si'"):
+            ReportWriter(tmp_path / "report.html", units="si")
+
+    def test_tells_where_a_part_of_the_source_starts(self, tmp_path):
+        report = ReportWriter(tmp_path / "report.html")
+        for index in range(5):
+            report(SimpleNamespace(index=index, time=75.5 + index / FPS, tracks=[track(1)]))
+        report.finish(video_report(5))
+        assert "Times count from 1:15.5 of the source." in (tmp_path / "report.html").read_text()
+        assert "Times count" not in write_report(tmp_path, FRAMES)
+
+    def test_the_script_gets_the_values_of_the_charts(self, tmp_path):
+        frames = [
+            [track(3, distance=10 + index, speed=-1.25)] if index not in (4, 5) else [] for index in range(9)
+        ]
+        data = json.loads(script_data(write_report(tmp_path, frames)))
+        assert data["fps"] == FPS
+        assert data["frames"] == 9
+        assert data["step"] == 1
+        assert data["tracks"] == [
+            {
+                "id": 3,
+                "color": 2,
+                "spans": [[0, 4], [6, 9]],
+                "first": 0,
+                "distance": [10.0, 11.0, 12.0, 13.0, None, None, 16.0, 17.0, 18.0],
+                "speed": [-4.5, -4.5, -4.5, -4.5, None, None, -4.5, -4.5, -4.5],
+                "rough": [0] * 9,
+            }
+        ]
+
+    def test_distances_with_large_standard_errors_are_marked(self, tmp_path):
+        frames = [[track(1, distance=20.0, distance_std=std)] for std in (3.0, 4.5, 9.0)]
+        data = json.loads(script_data(write_report(tmp_path, frames)))
+        assert data["tracks"][0]["rough"] == [0, 1, 1]
+
+    def test_speeds_with_large_standard_errors_are_hidden(self, tmp_path):
+        frames = [[track(1, speed=9.0, speed_std=3.5 - index)] for index in range(3)]
+        data = json.loads(script_data(write_report(tmp_path, frames)))
+        assert data["tracks"][0]["speed"] == [None, 32.4, 32.4]
+
+    @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan, 1e300, 10**400, np.float32(math.inf)])
+    def test_infinite_and_absurd_numbers_are_unknown(self, tmp_path, value):
+        extreme = track(1, distance=value, distance_std=value, speed=value, confidence=value)
+        text = write_report(tmp_path, [[extreme]] * 3)
+        StrictParser(text)
+        assert "No distance is known." in text
+        body = text.split("<main>")[1].split("<script>")[0]
+        assert not re.search(r"\b(nan|NaN|inf|Infinity|None)\b", body)
+
+    def test_the_same_run_gives_the_same_page(self, tmp_path, video):
+        assert write_report(tmp_path, FRAMES, video=video) == write_report(tmp_path, FRAMES, video=video)
+
+    def test_the_page_of_an_hour_of_video_is_small(self, tmp_path):
+        frames = 90_000
+        report = ReportWriter(tmp_path / "report.html")
+        for index in range(frames):
+            report.write(index, None, [track(1 + index // 900, distance=10 + index % 900 / 10)])
+        report.finish(video_report(frames))
+        text = (tmp_path / "report.html").read_text()
+        assert len(text) < 300_000
+        StrictParser(text)
+        assert "Most shown at once in each 15 seconds" in text
+        data = json.loads(script_data(text))
+        assert len(data["tracks"]) == 100
+        assert max(len(each["distance"]) for each in data["tracks"]) <= 9
+
+    def test_many_tracks_share_rows(self, tmp_path):
+        text = write_report(tmp_path, [[track(1 + index // 10)] for index in range(300)])
+        StrictParser(text)
+        bars = re.findall(r'<g class="bar c\d".*?</g>', text)
+        assert len(bars) == 30
+        assert len({y for bar in bars for y in re.findall(r' y="([\d.]+)"', bar)}) <= 2
+        assert all("show in the video" in bar for bar in bars)
+
+
+class TestSettingsAndModel:
+    def test_of_a_classifier_of_patches(self, tmp_path):
+        camera = Camera.for_frame((720, 1280), height_m=1.75)
+        options = {"camera": camera, "track_params": TrackParams(confirm_score=0.625)}
+        with VehicleDetector("highway", n_jobs=1, **options) as detector:
+            text = write_report(tmp_path, FRAMES, detector=detector)
+        assert "<dt>confirm score</dt><dd>0.625</dd>" in text
+        assert "<dt>height m</dt><dd>1.75</dd>" in text
+        assert "<summary>Camera</summary>" in text
+        assert "<summary>Regions (fitted boxes)</summary>" in text
+        assert "64\xa0\xd7\xa064" in text
+        model = load_classifier()
+        assert model.metadata["data"]["fingerprint"] in text
+        assert f"{model.metadata['metrics']['splits']['random']['accuracy']:.4f}" in text
+        assert f"<p>{model.summary()[0]}</p>" in text
+        assert f"<dt>color space</dt><dd>{model.params.color_space}</dd>" in text
+        assert "CC BY-NC-SA 3.0" in text
+
+    def test_of_a_network(self, tmp_path):
+        with VehicleDetector(n_jobs=1, horizon=0.5) as detector:
+            text = write_report(tmp_path, FRAMES, detector=detector)
+        assert "<dt>horizon</dt><dd>0.5</dd>" in text
+        assert "<summary>Camera (assumed)</summary>" in text
+        assert "Regions" not in text
+        title, facts = load_model().summary()
+        assert f"<p>{title}</p>" in text
+        assert all(html.escape(fact) in text for fact in facts.values() if "'" not in fact)
+        for name, scores in load_model().metadata["metrics"]["left_out"].items():
+            assert name in text
+            assert f"{scores['f1']:.3f}" in text
+        assert "inherits the terms of the data" in text
+
+    @pytest.mark.parametrize(
+        ("options", "focal"), [({"field_of_view": 90}, "640"), ({"camera": "fisheye-120"}, "611.155")]
+    )
+    def test_of_a_lens(self, tmp_path, options, focal):
+        """The camera is the one that the distances are computed with."""
+        with VehicleDetector(n_jobs=1, **options) as detector:
+            text = write_report(tmp_path, FRAMES, detector=detector)
+        assert "<summary>Camera</summary>" in text
+        assert f"<dt>focal px</dt><dd>{focal}</dd>" in text
+
+    def test_of_the_heat_map_of_the_course(self, tmp_path):
+        with VehicleDetector(n_jobs=1, region_params=HeatParams(threshold=2), horizon=0.5) as detector:
+            text = write_report(tmp_path, FRAMES, detector=detector)
+        assert "<summary>Regions (heat map)</summary>" in text
+        assert "<dt>threshold</dt><dd>2</dd>" in text
+        assert "fitted boxes" not in text
+        assert "<summary>Camera (assumed)</summary>" in text
+        assert "<dt>horizon px</dt><dd>360</dd>" in text
+
+    @pytest.mark.parametrize(
+        "metadata",
+        [
+            {},
+            {"note": "<i>mine</i>", "data": {"sources": {"own": 3}}, "metrics": 0.5},
+            {"data": "own", "metrics": {"splits": {"other": {"accuracy": 1.0}}, "left_out": {"a": "good"}}},
+            {"metrics": {"splits": {"random": "good", "sequences": {"accuracy": "high"}}, "left_out": 3}},
+        ],
+    )
+    @pytest.mark.parametrize("load", [load_classifier, load_model])
+    def test_metadata_may_hold_anything(self, tmp_path, load, metadata):
+        shipped = load()
+        if isinstance(shipped, type(load_classifier())):
+            model = type(shipped)(shipped.params, shipped.templates, metadata)
+        else:
+            model = dataclasses.replace(shipped, metadata=metadata)
+        text = write_report(tmp_path, FRAMES, detector=SimpleNamespace(model=model))
+        StrictParser(text)
+        assert "License: the model inherits the terms of the data it was trained on." in text
+        assert "<i>" not in text
+
+    @pytest.mark.parametrize("model", [None, SimpleNamespace(summary=print)])
+    def test_a_detector_of_another_library_has_neither(self, tmp_path, model):
+        text = write_report(tmp_path, FRAMES, detector=SimpleNamespace(model=model))
+        assert "Settings" not in text
+        assert "Model" not in text
+
+
+def color_schemes():
+    """Custom properties of the light and the dark color scheme."""
+    css = (Path(page.__file__).parent / "report.css").read_text(encoding="utf-8")
+    light, dark = re.findall(r":root \{(.*?)\}", css, re.DOTALL)
+    return [dict(re.findall(r"--(\w+): (#\w+);", scheme)) for scheme in (light, dark)]
+
+
+def linear_rgb(color):
+    parts = np.array([int(color[start : start + 2], 16) / 255 for start in (1, 3, 5)])
+    return np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+
+
+def luminance(color):
+    return float(linear_rgb(color) @ [0.2126, 0.7152, 0.0722])
+
+
+# Linear RGB as seen with full color blindness: Machado, Oliveira and Fernandes (2009).
+PROTANOPIA = [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]]
+DEUTERANOPIA = [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]]
+
+
+def lab_color(color, simulation):
+    seen = np.clip(np.array(simulation) @ linear_rgb(color), 0, 1).astype(np.float32)
+    srgb = np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)
+    return cv2.cvtColor(srgb.astype(np.float32)[None, None], cv2.COLOR_RGB2LAB)[0, 0]
+
+
+def contrast(one, other):
+    light, dark = sorted((luminance(one), luminance(other)), reverse=True)
+    return (light + 0.05) / (dark + 0.05)
+
+
+@pytest.mark.parametrize("scheme", color_schemes(), ids=["light", "dark"])
+class TestColors:
+    def test_contrast_with_the_background(self, scheme):
+        # Level AA of the Web Content Accessibility Guidelines 2.2: 4.5 for text, 3 for graphics.
+        for background in ("background", "panel"):
+            for color in ("text", "muted", "link"):
+                assert contrast(scheme[color], scheme[background]) >= 4.5, (color, background)
+        for number in range(len(TRACK_COLORS)):
+            assert contrast(scheme[f"c{number}"], scheme["background"]) >= 3.0, number
+
+    def test_track_colors_differ_for_color_blind_readers(self, scheme):
+        colors = [scheme[f"c{number}"] for number in range(len(TRACK_COLORS))]
+        for simulation in (PROTANOPIA, DEUTERANOPIA):
+            for one, other in combinations([lab_color(color, simulation) for color in colors], 2):
+                assert np.linalg.norm(one - other) >= 12  # CIE76
+
+    def test_there_are_as_many_track_colors_as_in_the_video(self, scheme):
+        names = [name for name in scheme if re.fullmatch(r"c\d", name)]
+        assert names == [f"c{number}" for number in range(len(TRACK_COLORS))]
+
+
+def test_events_and_counts_are_listed_with_buttons_that_seek(tmp_path):
+    events = [
+        Event(kind="cut_in", track_id=2, frame=12, start_frame=8, end_frame=14, time_s=0.48, side="left",
+              distance_m=12.5, distance_std_m=1.5),
+        Event(kind="overtaken", track_id=1, frame=40, start_frame=30, end_frame=40, time_s=1.6, side="right"),
+    ]  # fmt: skip
+    writer = ReportWriter(tmp_path / "report.html")
+    for index, tracks in enumerate(FRAMES):
+        writer.write(index, index / FPS, tracks)
+    writer.finish(video_report(len(FRAMES)), events=events)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    parser = StrictParser(page)
+    markers = [each for each in parser.all("g") if "vehicle" in each.get("aria-label", "")]
+    assert [marker["data-frame"] for marker in markers] == ["12", "40"]
+    buttons = [each for each in parser.all("button") if "vehicle" in each.get("aria-label", "")]
+    assert [button["data-frame"] for button in buttons] == ["12", "40"]
+    assert "<td>12.5 ± 1.5 m</td>" in page
+    row = re.search(r">0:00</button></th>(.*?)</tr>", page)[1]
+    assert re.findall("<td>(.*?)</td>", row) == ["0", "1", "0", "0", "1.2", "2"]
+
+
+def test_events_are_in_the_units_of_the_page(tmp_path):
+    event = Event(kind="met", track_id=2, frame=12, start_frame=8, end_frame=14, time_s=0.48, side="left",
+                  distance_m=12.5, distance_std_m=1.5, closing_std_mps=1.0, speed_mps=-20.0)  # fmt: skip
+    writer = ReportWriter(tmp_path / "report.html", units="imperial")
+    for index, tracks in enumerate(FRAMES):
+        writer.write(index, index / FPS, tracks)
+    writer.finish(video_report(len(FRAMES)), events=[event])
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<td>41.0 ± 4.9 ft</td>\n<td>45 ± 2 mph, oncoming</td>" in page
+    assert "distance 41.0 ± 4.9 ft: show in the video" in page
+    assert "12.5 ± 1.5 m" not in page
+
+
+def test_pictures_are_part_of_the_page(tmp_path):
+    writer = ReportWriter(tmp_path / "report.html")
+    for index, tracks in enumerate(FRAMES):
+        writer.write(index, index / FPS, tracks)
+    image = np.full((180, 320, 3), (200, 90, 0), np.uint8)
+    picture = TrackPicture(2, 25, image, "score 3.10, template 1: <margin> 0.50")
+    writer.finish(video_report(len(FRAMES)), pictures=[picture])
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    (shown,) = (each for each in StrictParser(page).all("img") if each["class"] == "why")
+    data = base64.b64decode(shown["src"].removeprefix("data:image/jpeg;base64,"))
+    decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert np.abs(decoded.astype(int) - image).max() < 10
+    assert "<h3>#2 at 0:01.0</h3><p>score 3.10, template 1: &lt;margin&gt; 0.50</p>" in page
+    assert "Why these boxes" not in write_report(tmp_path, FRAMES)
+
+
+def test_a_page_without_certain_events_says_so(tmp_path):
+    assert "No event was found." in write_report(tmp_path, FRAMES)
+    assert "No event was found." not in write_report(tmp_path, [[]])
+
+
+def test_minutes_are_buttons_that_seek_and_come_before_the_tracks(tmp_path):
+    writer = ReportWriter(tmp_path / "report.html")
+    for index in range(2 * 60 * FPS + 1):
+        writer.write(index, index / FPS, FRAMES[0])
+    writer.finish(video_report(2 * 60 * FPS + 1), events=[])
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    buttons = [
+        each for each in StrictParser(page).all("button") if re.match(r"\d:\d\d: show", each["aria-label"])
+    ]
+    assert [int(button["data-frame"]) for button in buttons] == [0, 60 * FPS, 120 * FPS]
+    assert '<th scope="row">Total</th>' in page
+    assert page.index("<h2>Events</h2>") < page.index(">2:00</button>") < page.index("<h2>Tracks</h2>")

@@ -1,0 +1,216 @@
+"""Trips of dash-cam files, from their names."""
+
+import itertools
+import os
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+
+from tests.video.clips import gray_frames, write_clip
+from vehicle_detection import InvalidInputError, open_trip
+from vehicle_detection.drive import find_trips
+from vehicle_detection.video import is_video_file
+
+
+def summary(names, **options):
+    return [(trip.camera, [str(file) for file in trip.files]) for trip in find_trips(names, **options)]
+
+
+@pytest.mark.parametrize(
+    ("name", "camera"),
+    [
+        ("20260131_081500_F.MP4", "front"),
+        ("2026_0131_081500_0001R.MP4", "rear"),
+        ("20260131_081500_NF.mp4", "front"),
+        ("20260131_081500_PR.mp4", "rear"),
+        ("NO20260131-081500-000123B.MP4", "rear"),
+        ("REC_2026_01_31_08_15_00_F.MP4", "front"),
+        ("2026-01-31_08-15-00-front.mp4", "front"),
+        ("2026-01-31_08-15-00-left_repeater.mp4", "left"),
+        ("20260131081500_000001A.MP4", "unknown"),
+        ("DCIM/Movie_Rear/20260131_081500.mp4", "rear"),
+        ("20260131_081500.mp4", "unknown"),
+    ],
+)
+def test_the_camera_and_the_time_of_a_name(name, camera):
+    (trip,) = find_trips([name])
+    assert (trip.camera, trip.start) == (camera, datetime(2026, 1, 31, 8, 15))
+
+
+@pytest.mark.parametrize(
+    ("name", "camera"),
+    [
+        ("drive.mp4", "unknown"),
+        ("drive b.mp4", "unknown"),
+        ("MOVI0001F.MP4", "front"),
+        ("front.mp4", "front"),
+        ("20269931_081500.mp4", "unknown"),
+    ],
+)
+def test_a_name_without_a_time(name, camera):
+    (trip,) = find_trips([name])
+    assert (trip.camera, trip.start) == (camera, None)
+
+
+def test_segments_of_two_cameras_and_two_drives():
+    minutes = [f"2026013108{minute:02}00" for minute in (15, 16, 17, 18)]
+    evening = [f"2026013118{minute:02}02" for minute in (1, 2)]
+    names = [f"{time}_{camera}.mp4" for time in (*minutes, *evening) for camera in "RF"]
+    assert summary(reversed(names)) == [
+        (name, [f"{time}_{letter}.mp4" for time in times])
+        for name, letter in (("front", "F"), ("rear", "R"))
+        for times in (minutes, evening)
+    ]
+
+
+def test_folders_are_different_trips():
+    names = ["a/20260131_081500.mp4", "b/20260131_081600.mp4"]
+    assert [files for _, files in summary(names)] == [[names[0]], [names[1]]]
+
+
+def test_clocks_that_drift_by_a_second():
+    names = [f"20260131_08{time}_F.mp4" for time in ("1500", "1601", "1701", "1800", "1859")]
+    assert summary(names) == [("front", names)]
+
+
+def test_a_short_segment_is_probed():
+    names = [f"20260131_08{time}_F.mp4" for time in ("1500", "1600", "1700", "1720", "1900", "2000")]
+    seconds = {names[2]: 20.0}
+    joined = [names[:4], names[4:]]
+    assert [files for _, files in summary(names, duration=seconds.__getitem__)] == joined
+    seconds = {names[2]: 11.0}
+    assert len(find_trips(names, duration=seconds.__getitem__)) == 3
+    assert len(find_trips(names)) == 3
+
+
+@pytest.mark.parametrize(("seconds", "trips"), [(59.9, 1), (30.0, 2), (63.0, 1), (64.0, 2)])
+def test_two_segments_are_probed(seconds, trips):
+    names = ["20260131_081500_F.mp4", "20260131_081600_F.mp4"]
+    assert len(find_trips(names, duration=lambda name: seconds)) == trips
+
+
+def test_numbers_without_times():
+    assert summary([f"GRMN{n:04}.MP4" for n in (9, 10, 11, 13)]) == [
+        ("unknown", ["GRMN0009.MP4", "GRMN0010.MP4", "GRMN0011.MP4"]),
+        ("unknown", ["GRMN0013.MP4"]),
+    ]
+    assert summary(["GX020007.MP4", "GX010008.MP4", "GX010007.MP4"]) == [
+        ("unknown", ["GX010007.MP4", "GX020007.MP4"]),
+        ("unknown", ["GX010008.MP4"]),
+    ]
+    assert len(find_trips(["drive.mp4", "walk.mp4"])) == 2
+
+
+@pytest.mark.parametrize(
+    ("ends", "trips"),
+    [
+        ((0, 0.5, 1, 1.5, 2), [5]),  # copied without their times
+        ((0, 60, 120, 180, 200), [5]),  # the last one is short
+        ((0, 60, 120, 180, 3600), [4, 1]),
+        ((0, 60, 120, 170, 230), [3, 2]),  # 20 s long, 30 s later
+    ],
+)
+def test_numbers_with_modification_times(tmp_path, ends, trips):
+    files = [tmp_path / f"GRMN{number:04}.MP4" for number in range(5)]
+    for file, end in zip(files, ends, strict=True):
+        file.touch()
+        os.utime(file, (1.77e9 + end, 1.77e9 + end))
+    seconds = {files[3]: 20.0, files[4]: 20.0}
+    found = find_trips(files, duration=seconds.__getitem__)
+    assert [len(trip.files) for trip in found] == trips
+
+
+def test_other_numbers_do_not_make_a_trip():
+    assert len(find_trips(["drive1.mp4", "drive2.mp4", "drive3.mp4"])) == 3
+
+
+def test_paths_and_urls_keep_their_type():
+    (trip,) = find_trips([Path("a/20260131_081500.mp4")])
+    assert trip.files == (Path("a/20260131_081500.mp4"),)
+    (trip,) = find_trips(["s3://bucket/a/20260131_081500.mp4"])
+    assert trip.files == ("s3://bucket/a/20260131_081500.mp4",)
+    assert str(trip) == "1 file"
+
+
+def test_hidden_files_are_no_videos():
+    assert [is_video_file(Path(name)) for name in ("a.MP4", "._a.mp4", "a.thm")] == [True, False, False]
+
+
+def test_the_query_of_a_url_tells_no_time():
+    names = [f"https://nas/card/20260131_08150{n}_F.mp4?X-Amz-Date=20300101T120000Z&sig=a/b" for n in (0, 1)]
+    (trip,) = find_trips(names, duration=lambda _: 1.0)
+    assert (trip.camera, len(trip.files), trip.start.year) == ("front", 2, 2026)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("car07_{}", "car08_{}"),
+        ("ch1_{}", "ch2_{}"),
+        ("{}_ch1", "{}_ch2"),
+        ("{}_1", "{}_2"),
+        ("Front_01_{}", "Front_02_{}"),
+        ("AB123CD_{}_F", "AB456CD_{}_F"),
+        ("123AB_{}_F", "456AB_{}_F"),
+    ],
+)
+def test_vehicles_and_channels_are_trips_of_their_own(names):
+    times = [f"20260131_0815{second:02}" for second in (0, 5, 10, 15)]
+    found = summary([f"{name.format(time)}.mp4" for name in names for time in times])
+    assert [files for _, files in found] == [[f"{name.format(time)}.mp4" for time in times] for name in names]
+
+
+@pytest.mark.parametrize(
+    ("form", "camera"),
+    [
+        ("2026_0131_0815{:02}_{:04}F.MP4", "front"),
+        ("NO20260131-0815{:02}-{:06}F.MP4", "front"),
+        ("DJI_202601310815{:02}_{:04}_D.MP4", "unknown"),
+        ("{1:04}_20260131_0815{0:02}.MP4", "unknown"),
+        ("2026_0131_0815{:02}_{:04}T.MP4", "unknown"),
+        ("260131_0815{:02}_{:03}_FH.MP4", "front"),
+        ("260131_0815{:02}_{:03}_RH.MP4", "rear"),
+        ("20260131_0815{:02}_REC{:04}.MP4", "unknown"),
+        ("20260131_0815{:02}_N{:03}F.MP4", "front"),
+    ],
+)
+def test_counters_of_files_are_no_names(form, camera):
+    names = [form.format(second, 7 + number) for number, second in enumerate((0, 5, 10, 15))]
+    assert summary(names) == [(camera, names)]
+    assert find_trips(names)[0].start == datetime(2026, 1, 31, 8, 15)
+
+
+def test_a_short_year_that_looks_like_a_long_one():
+    names = [f"200108_081{minute}00_00{minute}_FH.MP4" for minute in range(5, 8)]
+    assert summary(names) == [("front", names)]
+    assert find_trips(names)[0].start == datetime(2020, 1, 8, 8, 15)
+
+
+@pytest.fixture(scope="module")
+def card(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("card")
+    for second, camera in itertools.product((0, 1), "FR"):
+        write_clip(folder / f"20260131_08150{second}_{camera}.mp4", gray_frames(8), fps=8)
+    return folder
+
+
+def test_the_segments_of_a_pattern_become_one_video(card):
+    with open_trip(str(card / "*F.mp4")) as source:
+        assert [index for index, _, _ in source] == list(range(16))
+
+
+def test_several_trips_are_listed(card):
+    with pytest.raises(
+        InvalidInputError, match=r"2 trips \(front, 2 files from 20260131_081500_F.mp4; rear,"
+    ):
+        open_trip(card)
+
+
+def test_other_sources_are_those_of_open_source(card):
+    file = next(card.iterdir())
+    with open_trip(file) as source, open_trip(source) as same:
+        assert source is same
+        assert source.info.frames == 8
+    with pytest.raises(InvalidInputError, match="source must be"):
+        open_trip(None)

@@ -1,0 +1,491 @@
+"""`run_batch`: process many trips in parallel, and do only what is missing or has changed."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import re
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vehicle_detection._common import (
+    available_cores,
+    check_choice,
+    check_flags,
+    check_integer,
+    check_sequence,
+    check_type,
+    describe,
+    hide_credentials,
+    import_pyarrow,
+    pluralize,
+    progress_bar,
+)
+from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.drive.batch_plan import (
+    fingerprint_of,
+    group_files,
+    list_videos,
+    plan_trip,
+    shipped_model,
+    source_id,
+    trip_digest,
+    trip_id,
+)
+from vehicle_detection.drive.batch_records import (
+    DONE,
+    ERROR,
+    FAILED,
+    is_complete,
+    read_records,
+    record_keys,
+    write_record,
+)
+from vehicle_detection.drive.batch_store import Store, open_store
+from vehicle_detection.drive.batch_trip import BUSY, RECORDED, remove_replaced, run_trip, warm_up
+from vehicle_detection.drive.trips import Trip, find_trips
+from vehicle_detection.drive.worker_pool import WorkerPool
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.video import PRESETS
+
+# Attempts at a trip whose worker is lost.
+_ATTEMPTS = 3
+# Files that are looked up at the same time: a server takes a while to answer for each.
+_LOOKUPS = 16
+# Seconds between looks at a trip that another run is working on.
+_BUSY_INTERVAL = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchReport:
+    """What a run of `run_batch` did.
+
+    Attributes
+    ----------
+    trips
+        Number of trips of the sources (of this shard).
+    done, failed, errors
+        Number of trips that this run processed, whose source cannot be processed, and that the next run
+        repeats.
+    skipped
+        Number of trips that an earlier or another run completed or found to have failed.
+    frames
+        Number of frames that this run processed.
+    seconds
+        Elapsed time.
+    messages
+        Message of each failed trip and each error of this run, by its first source.
+    planned
+        With `dry_run`, the trips that would be processed: ``files``, ``camera``, ``start`` and ``replaces``,
+        the keys of earlier results that the new ones would replace; otherwise None.
+
+    Examples
+    --------
+    >>> print(
+    ...     BatchReport(trips=4, done=2, failed=1, errors=0, skipped=1, frames=300, seconds=6.0, messages={})
+    ... )
+    4 trips: 2 done, 1 failed, 0 errors, 1 skipped; 300 frames in 6.0 s, 50.0 frames/s
+    """
+
+    trips: int
+    done: int
+    failed: int
+    errors: int
+    skipped: int
+    frames: int
+    seconds: float
+    messages: Mapping[str, str]
+    planned: tuple[Mapping[str, Any], ...] | None = None
+
+    def __str__(self) -> str:
+        if self.planned is not None:
+            replaced = sum(len(each["replaces"]) for each in self.planned)
+            earlier = f"{pluralize(replaced, 'earlier result')} to replace, " if replaced else ""
+            return (
+                f"{pluralize(self.trips, 'trip')}: {len(self.planned):,} to process, {earlier}"
+                f"{self.skipped:,} skipped"
+            )
+        rate = self.frames / self.seconds if self.seconds else 0.0
+        return (
+            f"{pluralize(self.trips, 'trip')}: {self.done:,} done, {self.failed:,} failed, "
+            f"{pluralize(self.errors, 'error')}, {self.skipped:,} skipped; "
+            f"{pluralize(self.frames, 'frame')} in {self.seconds:.1f} s, {rate:.1f} frames/s"
+        )
+
+
+def run_batch(
+    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    out: str | os.PathLike[str],
+    executor: Executor | None = None,
+    *,
+    model: str | os.PathLike[str] = "default",
+    options: Mapping[str, Any] | None = None,
+    jobs: int | None = None,
+    shard: str | None = None,
+    group: str = "trip",
+    tracks_only: bool = False,
+    audio: bool = True,
+    preset: str = "veryfast",
+    retry_failed: bool = False,
+    dry_run: bool = False,
+    progress: bool = True,
+    on_record: Callable[[Mapping[str, Any]], object] | None = None,
+) -> BatchReport:
+    """Track the vehicles of many videos in parallel; a second run does what is missing or changed.
+
+    `out` gets, for each trip, ``tracks/date=D/camera=C/KEY.parquet``, the annotated video
+    ``videos/date=D/camera=C/KEY.mp4``, and ``records/KEY.json``, which is written last. KEY depends on the
+    trip's files (path or URL, size, modification time or entity tag), the model, the parameters and the
+    version of the library. If one of them changes, the new results replace the old ones, unless the changed
+    source cannot be processed.
+
+    Parameters
+    ----------
+    sources
+        Video files, folders, patterns and URLs. Consecutive segments are one trip, see `find_trips`. The
+        annotated videos in `out` are left out.
+    out
+        Folder to write, or a URL of storage that fsspec knows, such as ``"s3://bucket/results"``. Several
+        runs, also on several machines, may use one folder at the same time; at a URL, which has no locks, two
+        of them may both process a trip.
+    executor
+        A ``concurrent.futures`` executor, such as that of `open_dask`, whose workers see the same files.
+        None: worker processes of this machine.
+    model
+        A model's name or file.
+    options
+        Further arguments of `VehicleDetector` as JSON values, such as ``{"horizon": 0.55, "every": 2}``.
+    jobs
+        Number of worker processes with one thread each; None: one per core.
+    shard
+        ``"3/200"``: process the third of 200 parts, which depend on nothing but the paths.
+    group
+        ``"trip"`` or ``"file"``: make consecutive segments one trip, or each file.
+    tracks_only
+        Write no videos.
+    audio, preset
+        As in `process_video`.
+    retry_failed
+        Also process trips again whose source could not be processed.
+    dry_run
+        Only find out what is to be done: nothing is processed, written or removed.
+    progress
+        Show a progress bar in a terminal or a notebook.
+    on_record
+        Function that is called with the record of each trip when it is finished.
+
+    Returns
+    -------
+    BatchReport
+        Numbers of trips. A bad source, a lost worker or scheduler and a full disk are counted, not raised.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is invalid, a source does not exist, or pyarrow is missing.
+    TransientVideoError, OutputError
+        If remote sources, or the storage of `out`, do not answer when the batch starts.
+
+    Examples
+    --------
+    >>> report = run_batch("card", "results", jobs=2)  # doctest: +SKIP
+    >>> tracks = pandas.read_parquet("results/tracks")  # doctest: +SKIP
+    """
+    started = time.perf_counter()
+    check_choice(group, "group", ("trip", "file"))
+    part = _parse_shard(shard)
+    check_flags(
+        tracks_only=tracks_only, audio=audio, retry_failed=retry_failed, dry_run=dry_run, progress=progress
+    )
+    if executor is not None and not hasattr(executor, "submit"):
+        raise InvalidInputError(
+            f"executor must be an executor of concurrent.futures, got {describe(executor)}; omit it"
+        )
+    if on_record is not None and not callable(on_record):
+        raise InvalidInputError(f"on_record must be a function of a record; got {describe(on_record)}")
+    if options is not None:
+        check_type(options, "options", Mapping, "pass a dictionary")
+    workers = available_cores() if jobs is None else check_integer(jobs, "jobs", low=1, high=1024)
+    check_choice(preset, "preset", PRESETS)
+    if executor is None and not dry_run:
+        import_pyarrow()  # an error now, not after the first trip
+    settings = _settings(model, options, tracks_only=tracks_only, audio=audio, preset=preset)
+    single = isinstance(sources, (str, os.PathLike))
+    given = (sources,) if single else check_sequence(sources, "sources", "files, folders, patterns or URLs")
+    listed = list_videos(given)
+    store = open_store(out, create=not dry_run, exists=not dry_run)
+    tasks = _plan(listed, store, settings, group, part)
+    pending, superseded = _pending(tasks, store, retry_failed)
+    skipped = len(tasks) - len(pending)
+    planned = None
+    if dry_run:
+        names = ("files", "camera", "start", "replaces")
+        planned = tuple({name: task[name] for name in names} for task in pending)
+        pending, superseded, progress = [], [], False
+    for task, record in superseded:
+        remove_replaced(store, task, record)
+    counts = {DONE: 0, FAILED: 0, ERROR: 0}
+    frames = 0
+    messages: dict[str, str] = {}
+    with contextlib.ExitStack() as stack:
+        if executor is None and pending:
+            warm = warm_up, (settings, fingerprint_of(settings))
+            executor = stack.enter_context(WorkerPool(min(workers, len(pending)), warm))
+        bar = stack.enter_context(progress_bar(progress, len(pending), unit="trip", interactive_only=True))
+        for made in stack.enter_context(contextlib.closing(_run(executor, pending, store))):
+            bar.update()
+            if not made["new"]:
+                skipped += 1
+                continue
+            counts[made["status"]] += 1
+            frames += made.get("frames", 0)
+            if made["status"] != DONE:
+                messages[made["sources"][0]["uri"]] = made["message"]
+            if on_record is not None:
+                on_record(made)
+    return BatchReport(
+        trips=len(tasks),
+        done=counts[DONE],
+        failed=counts[FAILED],
+        errors=counts[ERROR],
+        skipped=skipped,
+        frames=frames,
+        seconds=time.perf_counter() - started,
+        messages=messages,
+        planned=planned,
+    )
+
+
+def _parse_shard(shard: object) -> tuple[int, int]:
+    if shard is None:
+        return 1, 1
+    found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", shard) if isinstance(shard, str) else None
+    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+        raise InvalidInputError(
+            f"shard must be a number and a count, such as 3/200 for the third of 200; got {describe(shard)}"
+        )
+    return int(found[1]), int(found[2])
+
+
+def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -> dict[str, Any]:
+    """Parameters that the results depend on, as plain values."""
+    if not isinstance(model, (str, os.PathLike)):
+        raise InvalidInputError(
+            f"model must be a name or the path of a file that workers can load, got {describe(model)}; save "
+            "the model to a file"
+        )
+    name = os.fspath(model)
+    if not shipped_model(name).is_file() and Path(name).exists():
+        name = os.path.abspath(name)
+    given = {name: _plain(value) for name, value in dict(options or {}).items()}
+    if os.path.isfile(str(given.get("camera"))):
+        given["camera"] = os.path.abspath(given["camera"])
+    settings = {"model": name, "options": given, **others}
+    try:
+        json.dumps(settings)
+    except TypeError as error:
+        raise InvalidInputError(
+            f"options must hold numbers, strings, lists and None, got {describe(options)}; {error}"
+        ) from None
+    try:
+        VehicleDetector(name, n_jobs=1, **given).close()  # an error now, not in every worker
+    except TypeError as error:
+        raise InvalidInputError(f"options must be arguments of VehicleDetector; {error}") from None
+    return settings
+
+
+def _plain(value: Any) -> Any:
+    """Return a path as text, and a number of NumPy as one of Python."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _plan(
+    listed: Mapping[str, Mapping[str, Any]],
+    store: Store,
+    settings: Mapping[str, Any],
+    group: str,
+    part: tuple[int, int],
+) -> list[dict[str, Any]]:
+    """Describe the work on each trip of this shard."""
+    files = [each for each in listed if not _is_result(each, store)]
+    if not files:
+        raise InvalidInputError("sources holds only videos that a batch wrote; pass the videos to process")
+    trips = group_files(files, group)
+    fingerprint = fingerprint_of(settings)
+    earlier: dict[str, list[str]] = {}  # keys of records by the identity of their trip
+    for key in record_keys(store):
+        earlier.setdefault(key.partition("-")[0], []).append(key)
+    number, count = part
+    tasks = []
+    mine = [trip for trip in trips if int(trip_id(trip), 16) % count == number - 1]
+    with ThreadPoolExecutor(_LOOKUPS, thread_name_prefix="vehicle-plan") as pool:
+        plans = list(pool.map(lambda trip: plan_trip(trip, listed, settings, fingerprint), mine))
+    longer = _longer_records(plans, earlier, store)
+    for trip, plan in zip(mine, plans, strict=True):
+        trip, plan = _without_recorded(trip, plan, longer.get(plan["sources"][0]["uri"]), listed)
+        task = plan | {"out": store.name}
+        # A trip replaces the earlier ones that began with one of its files.
+        ids = (source_id(str(file)) for file in trip.files)
+        keys = [key for each in ids for key in earlier.get(each, ())]
+        task["recorded"] = task["key"] in earlier.get(task["key"].partition("-")[0], ())
+        task["replaces"] = [key for key in keys if key != task["key"]]
+        tasks.append(task)
+    return tasks
+
+
+def _is_result(file: str, store: Store) -> bool:
+    """Whether a file is an annotated video of this batch, or of another one in a folder."""
+    found = re.fullmatch(r"(.+)[/\\]videos[/\\]date=[^/\\]+[/\\]camera=[^/\\]+[/\\]([^/\\]+)\.mp4", file)
+    if found is None:
+        return False
+    return found[1] == store.name or os.path.isfile(f"{found[1]}/records/{found[2]}.json")
+
+
+def _longer_records(
+    plans: Iterable[Mapping[str, Any]], earlier: Mapping[str, Sequence[str]], store: Store
+) -> dict[str, dict[str, Any]]:
+    """Find complete records of trips whose first segments are gone, by each of their other segments.
+
+    A camera that records in a loop deletes its oldest files.
+    """
+    new = [plan for plan in plans if plan["key"].partition("-")[0] not in earlier]
+    if not new or not earlier:
+        return {}
+    # Records are read only of the same days and cameras: there may be very many.
+    places = {f"tracks/date={plan['date']}/camera={plan['camera']}" for plan in new}
+    outputs = (path.rpartition("/") for path in store.list_files("tracks"))
+    keys = {name.partition(".")[0] for place, _, name in outputs if place in places}
+    found: dict[str, dict[str, Any]] = {}
+    for record in read_records(store, sorted(keys)).values():
+        if record["status"] == DONE and is_complete(record, store.exists):
+            found |= {source["uri"]: record for source in record["sources"][1:]}
+    return found
+
+
+def _without_recorded(
+    trip: Trip,
+    plan: dict[str, Any],
+    record: Mapping[str, Any] | None,
+    listed: Mapping[str, Mapping[str, Any]],
+) -> tuple[Trip, dict[str, Any]]:
+    """Leave out the first files of a trip that a longer record holds, if it has the same parameters."""
+    settings, fingerprint = plan["settings"], plan["fingerprint"]
+    if record is None:
+        return trip, plan
+    if record["key"].partition("-")[2] != trip_digest(record["sources"], settings, fingerprint):
+        return trip, plan
+    held = sum(1 for _ in takewhile(record["sources"].__contains__, plan["sources"]))
+    if held == len(trip.files):
+        return trip, plan | {"key": record["key"]}
+    rest = replace(trip, files=trip.files[held:], start=find_trips([trip.files[held]])[0].start)
+    return rest, plan_trip(rest, listed, settings, fingerprint)
+
+
+def _pending(
+    tasks: Iterable[dict[str, Any]], store: Store, retry_failed: bool
+) -> tuple[list[dict[str, Any]], list[tuple[dict[str, Any], dict[str, Any]]]]:
+    """Select the trips that are missing, incomplete or, with `retry_failed`, have failed.
+
+    Also returns complete ones with their records that have replaced others, which are still there.
+    """
+    records = read_records(store, (task["key"] for task in tasks if task["recorded"]))
+    outputs = {path for kind in ("tracks", "videos") for path in store.list_files(kind)} if records else set()
+    pending, superseded = [], []
+    for task in tasks:
+        record = records.get(task["key"])
+        again = retry_failed and record is not None and record["status"] == FAILED
+        if again or not is_complete(record, outputs.__contains__):
+            pending.append({**task, "again": again})
+        elif record is not None and task["replaces"]:  # such as an error while the source was away
+            superseded.append((task, record))
+    return pending, superseded
+
+
+def _run(
+    executor: Executor | None, pending: Iterable[dict[str, Any]], store: Store
+) -> Generator[Mapping[str, Any]]:
+    """Yield the record of each trip; closing it cancels those that have not begun."""
+    attempts: Counter[str] = Counter()
+    running: dict[Future[Any], dict[str, Any]] = {}
+    finished: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
+    busy: list[dict[str, Any]] = []
+
+    def submit(task: dict[str, Any]) -> None:
+        assert executor is not None
+        future = executor.submit(run_trip, task)
+        running[future] = task
+        future.add_done_callback(finished.put)
+
+    waiting = deque(pending)  # not submitted; what is left if the executor breaks has an error
+    try:
+        while waiting or running or busy:
+            while waiting:
+                submit(waiting[0])
+                waiting.popleft()
+            if not running:  # only trips that other runs are working on are left
+                time.sleep(_BUSY_INTERVAL)
+                waiting, busy = deque(busy), []
+                continue
+            future = finished.get()
+            task = running.pop(future)
+            waiting.append(task)
+            record = _outcome(future, task, attempts, store)
+            if record is None:
+                submit(task)
+            elif record["status"] == BUSY:
+                busy.append(task)
+            else:
+                yield record
+            waiting.pop()
+    except BrokenExecutor as error:  # such as a scheduler that was killed: the next run does the rest
+        for task in (*waiting, *running.values(), *busy):
+            yield _basic_record(task, f"{error}") | {"new": True}
+    finally:
+        for future in running:
+            future.cancel()
+
+
+def _outcome(
+    future: Future[Any], task: Mapping[str, Any], attempts: Counter[str], store: Store
+) -> dict[str, Any] | None:
+    """Record of a call that has ended; None to try again after it has lost its worker."""
+    try:
+        record: dict[str, Any] = future.result()
+    except BrokenExecutor:  # all other calls fail as well
+        raise
+    except Exception as error:
+        attempts[task["key"]] += 1
+        return None if attempts[task["key"]] < _ATTEMPTS else _lost_record(task, error, store)
+    return record
+
+
+def _lost_record(task: Mapping[str, Any], error: Exception, store: Store) -> dict[str, Any]:
+    """Record a trip that has ended its worker in every attempt."""
+    record = _basic_record(task, hide_credentials(f"{error}, {_ATTEMPTS} times"))
+    try:
+        write_record(store, record)
+    except (OSError, InvalidInputError) as unwritten:
+        record["message"] += f"; {unwritten}"
+    return record | {"new": True}
+
+
+def _basic_record(task: Mapping[str, Any], message: str) -> dict[str, Any]:
+    """Record of a trip without a result."""
+    return {
+        **{name: task[name] for name in RECORDED},
+        "status": ERROR,
+        "message": message,
+        "started": time.time(),
+    }

@@ -1,0 +1,130 @@
+"""Counts of vehicles met and passed, by minute, and the density of the traffic."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from vehicle_detection._common import check_number, check_type, pluralize
+from vehicle_detection.drive.events import Event, Kind, check_events
+from vehicle_detection.drive.history import TrackLog
+
+COUNTED: tuple[Kind, ...] = ("met", "overtaken", "overtaking", "passed")
+"""Kinds of events that are counted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MinuteCounts:
+    """Counts of one minute, or of a whole drive.
+
+    Attributes
+    ----------
+    start_s, seconds
+        Start and duration; the last minute may be shorter.
+    met, overtaken, overtaking, passed
+        Number of these events; see `Event`.
+    mean_in_view, max_in_view
+        Mean and maximum of the number of vehicles in view: the density of the traffic as the camera sees it.
+    """
+
+    start_s: float
+    seconds: float
+    met: int = 0
+    overtaken: int = 0
+    overtaking: int = 0
+    passed: int = 0
+    mean_in_view: float = 0.0
+    max_in_view: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleCounts:
+    """Counts of a drive.
+
+    Attributes
+    ----------
+    vehicles
+        Number of different tracks.
+    total, minutes
+        `MinuteCounts` of the whole drive and of each of its minutes.
+    """
+
+    vehicles: int
+    total: MinuteCounts
+    minutes: tuple[MinuteCounts, ...]
+
+    def summary(self) -> str:
+        """Describe the counts in one line, whose subject is the own vehicle."""
+        total = self.total
+        counts = f"overtook {pluralize(total.overtaken, 'vehicle')}, was overtaken by {total.overtaking}"
+        counts += f", met {total.met} oncoming"
+        counts += f", passed {pluralize(total.passed, 'other')}" if total.passed else ""
+        return f"{counts}; {total.mean_in_view:.1f} vehicles in view on average, {total.max_in_view} at most"
+
+
+def count_vehicles(events: Iterable[Event], log: TrackLog, *, fps: float) -> VehicleCounts:
+    """Count the vehicles of a drive.
+
+    Parameters
+    ----------
+    events, log
+        What `find_events` found, and the `TrackLog` that it was given.
+    fps
+        Frame rate.
+
+    Returns
+    -------
+    VehicleCounts
+        Counts of the whole drive and of each of its minutes.
+
+    Raises
+    ------
+    InvalidInputError
+        If the frame rate is not a positive number.
+
+    Examples
+    --------
+    >>> from vehicle_detection import Event
+    >>> log = TrackLog()
+    >>> for frame in range(3000):
+    ...     log.add(frame, None, [])
+    >>> event = Event(kind="met", track_id=1, frame=1600, start_frame=1580, end_frame=1600, time_s=64.0)
+    >>> counts = count_vehicles([event], log, fps=25)
+    >>> [minute.met for minute in counts.minutes]
+    [0, 1]
+    >>> print(counts.summary())
+    overtook 0 vehicles, was overtaken by 0, met 1 oncoming; 0.0 vehicles in view on average, 0 at most
+    """
+    rate = check_number(fps, "fps", above=0, high=1e6)
+    check_type(log, "log", TrackLog, "pass the TrackLog of the video")
+    listed = check_events(events)
+    frames = np.array(log.counts, np.int64)
+    minutes = range(math.ceil(len(frames) / rate / 60 - 1e-9))
+    edges = [min(round(number * 60 * rate), len(frames)) for number in (*minutes, len(minutes))]
+    return VehicleCounts(
+        vehicles=len(log.histories()),
+        total=_count(listed, frames, 0, len(frames), rate),
+        minutes=tuple(_count(listed, frames, *pair, rate) for pair in pairwise(edges)),
+    )
+
+
+def _count(events: list[Event], frames: Any, start: int, stop: int, fps: float) -> MinuteCounts:
+    """Count the events and vehicles of a half-open range of frames."""
+    kinds = Counter(event.kind for event in events if start <= event.frame < stop)
+    inside = frames[start:stop]
+    return MinuteCounts(
+        start_s=start / fps,
+        seconds=(stop - start) / fps,
+        met=kinds["met"],
+        overtaken=kinds["overtaken"],
+        overtaking=kinds["overtaking"],
+        passed=kinds["passed"],
+        mean_in_view=round(float(inside.mean()), 2) if len(inside) else 0.0,
+        max_in_view=int(inside.max(initial=0)),
+    )

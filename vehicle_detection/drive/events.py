@@ -1,0 +1,473 @@
+"""Events of a drive, derived from its tracks: following, closing in, cut-ins, overtaking and meeting."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vehicle_detection._common import (
+    UNITS,
+    Floats,
+    Units,
+    check_array,
+    check_number,
+    check_sequence,
+    check_shape,
+    check_type,
+    describe,
+)
+from vehicle_detection.camera import Camera
+from vehicle_detection.drive.history import TrackHistory, TrackLog, split_runs
+from vehicle_detection.drive.motion import LANE_HALF_WIDTH_M, Bools, Motion, estimate_motion
+from vehicle_detection.errors import InvalidInputError
+
+Kind = Literal[
+    "headway",
+    "closest_approach",
+    "closing",
+    "hard_closing",
+    "cut_in",
+    "overtaken",
+    "overtaking",
+    "met",
+    "passed",
+]
+Side = Literal["left", "right"]
+KINDS: dict[Kind, str] = {
+    "headway": "following",
+    "closest_approach": "closest approach",
+    "closing": "closing in",
+    "hard_closing": "closing in hard",
+    "cut_in": "cut-in",
+    "overtaken": "overtaken by us",
+    "overtaking": "overtook us",
+    "met": "met (oncoming)",
+    "passed": "passed by us",
+}
+"""Name of each kind of event for readers."""
+
+# Shortest duration (s) of a track, of following a vehicle, and of being in or out of the camera's lane.
+_MIN_TRACK, _MIN_FOLLOWING, _MIN_IN_LANE = 0.5, 2.0, 0.5
+# Largest relative error of a distance, a headway and a time to collision that is stated.
+_MAX_STD = 0.3
+# Largest relative error of a vehicle's growth that leaves no doubt about its sign.
+_MAX_PASSING_STD = 0.5
+# Largest standard error (m/s) of a closing speed that is stated.
+_MAX_SPEED_STD = 5.0
+# Largest distance (m) of a closest approach and of a cut-in.
+_NEAR_M, _CUT_IN_M = 12.0, 40.0
+# Times to collision (s), required deceleration (m/s^2) and shortest duration (s) of the closing kinds.
+_CLOSING_TIME, _HARD_TIME, _HARD_DECELERATION, _MIN_CLOSING = 4.0, 2.5, 3.0, 0.3
+# Time (s) for which a vehicle is seen before and after its closest approach; else a smaller distance may have
+# been missed.
+_MIN_AROUND = 0.5
+# Longest duration (s) of a lane change, and its largest lateral speed (m/s): crossing vehicles, and all
+# vehicles while the camera turns, are faster.
+_LANE_CHANGE, _MAX_LATERAL_SPEED = 6.0, 3.0
+# Time (s) before it is beside the camera until which, or after it from which, a passing vehicle is seen; and
+# change of size that it must show.
+_PASSING_TIME, _PASSING_RATIO = 2.5, 1.3
+# Distance (m) to a passing vehicle where it is first or last seen.
+_PASSING_M = 25.0
+# Closing speeds (m/s) of vehicles that are overtaken and of oncoming ones, where the own speed is unknown.
+_SLOWEST_ONCOMING, _FASTEST_OVERTAKEN = 20.0, 14.0
+# Speed (m/s) over the road from which a vehicle moves.
+_MOVING = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """Something that happened between the camera's vehicle and another one.
+
+    Attributes
+    ----------
+    kind
+        ``"headway"``: it was followed, at its smallest distance; ``"closest_approach"``: it was nearer than
+        12 m; ``"closing"`` and ``"hard_closing"``: the time to collision was at most 4 s, and at most 2.5 s
+        or the deceleration that avoids a collision at least 3 m/s²; ``"cut_in"``: it moved into the lane of
+        the camera; ``"overtaken"``, ``"overtaking"``, ``"met"``: the camera overtook it, it overtook the
+        camera, it came towards the camera; ``"passed"``: it was passed, and either stood or its direction is
+        not certain.
+    track_id, frame, start_frame, end_frame
+        Track of the vehicle; frame of the event, counted from 0 in the processed part of the video; and first
+        and last frame that belong to it.
+    time_s
+        Time of the event in seconds since the first processed frame.
+    side
+        ``"left"`` or ``"right"`` of the camera, for vehicles that pass or cut in.
+    distance_m, distance_std_m
+        Distance at `frame` and its standard error, where the relative error is at most 0.3.
+    closing_mps, closing_std_mps
+        Speed of approach, negative when moving away, where its standard error is at most 5 m/s.
+    headway_s, headway_std_s
+        Distance over own speed, where the own speed is known.
+    ttc_s, ttc_std_s
+        Smallest time to collision at constant speeds, for the closing kinds.
+    speed_mps
+        Speed of the vehicle over ground in the camera's direction, negative when oncoming: own speed minus
+        `closing_mps`, where both are known.
+    """
+
+    kind: Kind
+    track_id: int
+    frame: int
+    start_frame: int
+    end_frame: int
+    time_s: float
+    side: Side | None = None
+    distance_m: float | None = None
+    distance_std_m: float | None = None
+    closing_mps: float | None = None
+    closing_std_mps: float | None = None
+    headway_s: float | None = None
+    headway_std_s: float | None = None
+    ttc_s: float | None = None
+    ttc_std_s: float | None = None
+    speed_mps: float | None = None
+
+    def __str__(self) -> str:
+        return self.text(UNITS["metric"])
+
+    def text(self, units: Units, *, with_time: bool = True) -> str:
+        """Describe the event in a line, with its known values.
+
+        Parameters
+        ----------
+        units
+            Units of the distance, a value of ``vehicle_detection._common.UNITS``.
+        with_time
+            Start with the time of the event.
+
+        Returns
+        -------
+        str
+            Such as ``"12.0 s: following vehicle 4, headway 0.6 ± 0.1 s, distance 14.2 ± 1.2 m"``.
+        """
+        vehicle, kind = f"vehicle {self.track_id}", KINDS[self.kind]
+        # The camera's vehicle follows; in all other events the other one acts, or is met.
+        what = f"{kind} {vehicle}" if self.kind == "headway" else f"{vehicle} {kind}"
+        parts = [f"{self.time_s:.1f} s: " * with_time + what]
+        parts += [f"on the {self.side}"] if self.side else []
+        listed = (
+            ("time to collision", self.ttc_s, self.ttc_std_s, 1.0, "s"),
+            ("headway", self.headway_s, self.headway_std_s, 1.0, "s"),
+            ("distance", self.distance_m, self.distance_std_m, units.distance, units.distance_symbol),
+        )
+        for name, value, std, factor, unit in listed:
+            if value is not None:
+                parts.append(f"{name} {factor * value:.1f} ± {factor * (std or 0):.1f} {unit}")
+        return ", ".join(parts)
+
+
+EVENT_COLUMNS = tuple(field.name for field in fields(Event))
+"""Columns of a table of events."""
+
+
+def check_events(events: object) -> list[Event]:
+    """Return `events` as a list, unless one is something else."""
+    listed = list(check_sequence(events, "events", "Event"))
+    for event in listed:
+        check_type(event, "events", Event, "pass what find_events returned")
+    return listed
+
+
+def find_events(
+    log: TrackLog | Iterable[TrackHistory],
+    *,
+    fps: float,
+    shape: tuple[int, ...],
+    camera: Camera | None = None,
+    own_speed_mps: float | ArrayLike | None = None,
+) -> tuple[Event, ...]:
+    """Find the events of a drive in its tracks.
+
+    Each event is stated only where the errors of the camera and of the boxes allow it; what is not listed may
+    have happened all the same. The events describe footage and are no basis for safety decisions.
+
+    Parameters
+    ----------
+    log
+        The tracks that a `TrackLog` collected, or its histories.
+    fps, shape
+        Frame rate, and ``(height, width, ...)`` of the frames.
+    camera
+        The camera, whose focal length converts columns to meters; None: a typical dash-cam.
+    own_speed_mps
+        Speed of the camera's vehicle in m/s, a number or one for each frame, NaN where it is unknown; None:
+        unknown. Headways in seconds need it, and it tells oncoming from overtaken vehicles.
+
+    Returns
+    -------
+    tuple of Event
+        In the order of their times.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed.
+
+    Notes
+    -----
+    A lane change of the camera's own vehicle behind another one looks like a cut-in, unless other vehicles
+    show that all of them moved.
+
+    Examples
+    --------
+    >>> from vehicle_detection import Detections, Tracker
+    >>> tracker, log = Tracker(fps=25), TrackLog()
+    >>> for frame in range(75):  # a car that is nearer by 10 m every second
+    ...     size = 1155 / (45 - 0.4 * frame)
+    ...     box = [640 - 0.9 * size, 420 - 0.3 * size, 640 + 0.9 * size, 420 + 1.2 * size]
+    ...     log.add(frame, frame / 25, tracker.update(Detections([box], [2.0]), (720, 1280, 3)))
+    >>> [event.kind for event in find_events(log, fps=25, shape=(720, 1280, 3))]
+    ['hard_closing', 'headway']
+    """
+    rate = check_number(fps, "fps", above=0, high=1e6)
+    frame_shape = check_shape(shape)
+    if camera is None:
+        camera = Camera.for_frame(frame_shape)
+    check_type(camera, "camera", Camera, "omit it for a typical dash-cam")
+    camera = camera.for_shape(frame_shape)
+    histories = log.histories() if isinstance(log, TrackLog) else check_sequence(log, "log", "TrackHistory")
+    for each in histories:
+        check_type(each, "log", TrackHistory, "pass a TrackLog, or what its histories() returns")
+    length = max((track.last + 1 for track in histories), default=0)
+    own_speed = _check_speed(own_speed_mps, length)
+    motions = [
+        estimate_motion(track, fps=rate, shape=frame_shape, camera=camera)
+        for track in histories
+        if len(track.frames) >= _MIN_TRACK * rate and np.isfinite(track.boxes).all()
+    ]
+    events: list[Event] = []
+    for motion in motions:
+        finder = _Finder(motion, rate, own_speed)
+        events += [*finder.following(), *finder.closest(), *finder.closing(), *finder.cut_in(motions)]
+        events += finder.passing(starts_late=motion.track.first > 0.5 * rate)
+    return tuple(sorted(events, key=lambda event: (event.frame, event.track_id, event.kind)))
+
+
+def _check_speed(speed: float | ArrayLike | None, length: int) -> Floats:
+    """Own speed in each frame, NaN where it is unknown."""
+    if speed is None:
+        return np.full(length, np.nan)
+    array = check_array(speed, "own_speed_mps")
+    shaped = array.ndim == 0 or (array.ndim == 1 and len(array) >= length)
+    if not shaped or array.dtype.kind not in "iuf" or np.isinf(array).any() or (array < 0).any():
+        raise InvalidInputError(
+            "own_speed_mps must be a number of at least 0, or one for each frame, "
+            f"got {describe(speed)}; pass meters per second"
+        )
+    return np.asarray(np.broadcast_to(array, length) if array.ndim == 0 else array, np.float64)
+
+
+@dataclass(frozen=True)
+class _Finder:
+    """Finds the events of one track."""
+
+    motion: Motion
+    fps: float
+    own_speed: Floats  # in each frame; NaN where it is unknown
+
+    def following(self) -> Iterable[Event]:
+        """Yield each time that the vehicle was followed, at the smallest distance."""
+        motion = self.motion
+        near = motion.in_path & (motion.distance_std <= _MAX_STD * motion.distance)
+        for start, stop in self._runs(near, _MIN_FOLLOWING):
+            rows = _rows(near, start, stop)
+            stated = motion.track.columns["distance_m"]
+            distance = np.where(np.isfinite(stated), stated, motion.distance)
+            yield self._event("headway", int(rows[np.argmin(distance[rows])]), start, stop)
+
+    def closest(self) -> Iterable[Event]:
+        """Yield the closest approach, if it was near."""
+        found, seconds = self.motion.track.closest_approach(self.fps), self.motion.seconds
+        if found is None or found.distance_m > _NEAR_M:
+            return
+        row = int(np.searchsorted(self.motion.track.frames, found.frame))
+        event = self._event("closest_approach", row, row, row + 1)
+        whole = min(seconds[row] - seconds[0], seconds[-1] - seconds[row]) >= _MIN_AROUND
+        if whole and event.distance_m is not None:
+            yield event
+
+    def closing(self) -> Iterable[Event]:
+        """Yield each time that the time to collision was short."""
+        motion = self.motion
+        time, std = motion.time_to_collision, motion.time_to_collision_std
+        with np.errstate(invalid="ignore"):
+            ahead = np.abs(motion.lateral + motion.lateral_rate * time) < LANE_HALF_WIDTH_M
+            short = motion.in_path & ahead & (time > 0) & (time <= _CLOSING_TIME) & (std <= _MAX_STD * time)
+        for start, stop in self._runs(short, _MIN_CLOSING):
+            rows = _rows(short, start, stop)
+            row = int(rows[np.argmin(time[rows])])
+            # The largest of many estimates is too large, so each is lowered by its standard error.
+            closing = motion.closing[rows] * (1 - std[rows] / time[rows])
+            deceleration = float((closing**2 / (2 * motion.distance[rows])).max())
+            hard = time[row] <= _HARD_TIME or deceleration >= _HARD_DECELERATION
+            yield self._event("hard_closing" if hard else "closing", row, start, stop)
+
+    def cut_in(self, motions: Sequence[Motion]) -> Iterable[Event]:
+        """Yield each time that the vehicle moved from another lane into that of the camera."""
+        motion = self.motion
+        with np.errstate(invalid="ignore"):
+            slow = np.nan_to_num(np.abs(motion.closing)) < _FASTEST_OVERTAKEN
+            near = (motion.distance <= _CUT_IN_M) & slow
+        beside = self._runs(motion.beside_path & near, _MIN_IN_LANE)
+        for start, _ in self._runs(motion.in_path & near, _MIN_IN_LANE):
+            before = [end for _, end in beside if end <= start]
+            if not before or motion.seconds[start] - motion.seconds[before[-1] - 1] > _LANE_CHANGE:
+                continue
+            begin = before[-1] - 1
+            if np.nanmedian(np.abs(motion.lateral_rate[begin : start + 1])) > _MAX_LATERAL_SPEED:
+                continue
+            if motion.lateral[begin] * motion.lateral[start] < -(LANE_HALF_WIDTH_M**2) or self._moved_alike(
+                motions, begin, start
+            ):
+                continue
+            inside = np.flatnonzero(np.abs(motion.lateral[begin : start + 1]) < LANE_HALF_WIDTH_M)
+            row = begin + int(inside[0])
+            side: Side = "right" if motion.lateral[begin] > 0 else "left"
+            yield self._event("cut_in", row, begin, start + 1, side=side)
+
+    def _moved_alike(self, motions: Sequence[Motion], begin: int, end: int) -> bool:
+        """Whether other vehicles moved sideways as this one did, which is a motion of the camera."""
+        own = self.motion
+        change = own.lateral[end] - own.lateral[begin]
+        changes = []
+        for other in motions:
+            if other is own:
+                continue
+            rows = np.flatnonzero(other.at(own.seconds[begin], own.seconds[end]) & (other.at_side == 0))
+            if len(rows) and other.seconds[rows[-1]] - other.seconds[rows[0]] > 0.6 * (
+                own.seconds[end] - own.seconds[begin]
+            ):
+                changes.append(other.lateral[rows[-1]] - other.lateral[rows[0]])
+        return bool(changes) and float(np.median(changes)) / change > 0.5
+
+    def passing(self, *, starts_late: bool) -> Iterable[Event]:
+        """Yield whether it was passed when it left the frame, or overtook when it came into the frame."""
+        motion = self.motion
+        inverse = 1 / motion.distance
+        known = np.flatnonzero(np.isfinite(motion.time_to_collision) & np.isfinite(inverse))
+        if not known.size:
+            return
+        first, last = int(known[0]), int(known[-1])
+        yield from self._left_behind(first, last)
+        if starts_late or motion.at_side[: max(int(0.3 * self.fps), 1)].any():
+            yield from self._came_past(first, last)
+
+    def _left_behind(self, first: int, last: int) -> Iterable[Event]:
+        motion = self.motion
+        time, error = motion.time_to_collision[last], motion.slope_error[last]
+        ends_at_side = motion.at_side[-max(int(0.3 * self.fps), 1) :].any()
+        if not 0 < time <= _PASSING_TIME or error > _MAX_PASSING_STD or not self._beside(last):
+            return
+        grown = np.nanmax(motion.distance[first : last + 1]) / motion.distance[last]
+        if grown < _PASSING_RATIO or not (ends_at_side or motion.distance[last] <= _PASSING_M):
+            return
+        rows = np.arange(max(first, last - round(self.fps)), last + 1)
+        rows = rows[motion.time_to_collision[rows] > 0]
+        closing, closing_std = (float(np.median(each[rows])) for each in (motion.closing, motion.closing_std))
+        kind = self._passing_kind(closing, closing_std, int(motion.track.frames[last]))
+        yield self._event(kind, last, int(rows[0]), last + 1, side=self._side(last))
+
+    def _came_past(self, first: int, last: int) -> Iterable[Event]:
+        motion = self.motion
+        time = motion.time_to_collision
+        at_side = motion.at_side[: max(int(0.3 * self.fps), 1)].any()
+        # Where its motion away is certain for the first time, at most a few seconds after its first frame.
+        sure = np.flatnonzero((time < 0) & (motion.slope_error < _MAX_PASSING_STD))
+        near = first + int(np.nanargmin(motion.distance[first : first + max(round(self.fps), 1)]))
+        if not sure.size or not self._beside(first) or motion.distance[near] > _PASSING_M:
+            return
+        row = int(sure[0])
+        recent = -time[row] - (motion.seconds[row] - motion.seconds[first]) <= _PASSING_TIME
+        shrunk = motion.distance[last] / motion.distance[near]
+        if shrunk >= _PASSING_RATIO and (at_side or recent):
+            yield self._event(
+                "overtaking", near, first, max(row, near) + 1, side=self._side(first), speed_row=row
+            )
+
+    def _passing_kind(self, closing: float, std: float, frame: int) -> Kind:
+        speed = float(self.own_speed[frame]) - closing  # over the road, in the camera's direction
+        if math.isfinite(speed):
+            if abs(speed) > max(_MOVING, std):
+                return "overtaken" if speed > 0 else "met"
+        elif closing - std > _SLOWEST_ONCOMING:
+            return "met"
+        elif closing + std < _FASTEST_OVERTAKEN:
+            return "overtaken"
+        return "passed"
+
+    def _beside(self, row: int) -> bool:
+        """Whether the vehicle is not straight ahead."""
+        return bool(self.motion.at_side[row]) or abs(self.motion.lateral[row]) > 0.7 * LANE_HALF_WIDTH_M
+
+    def _side(self, row: int) -> Side:
+        return "right" if (self.motion.at_side[row] or self.motion.lateral[row]) > 0 else "left"
+
+    def _runs(self, mask: Bools, seconds: float) -> list[tuple[int, int]]:
+        """Half-open ranges of rows where `mask` holds for so long; gaps up to 0.25 s are closed."""
+        rows = np.flatnonzero(mask)
+        step = max(int(0.25 * self.fps), 1)
+        runs = [rows[each] for each in split_runs(self.motion.track.frames[rows], step)]
+        times = self.motion.seconds
+        return [
+            (int(run[0]), int(run[-1]) + 1)
+            for run in runs
+            if times[run[-1]] - times[run[0]] >= seconds - 1e-9
+        ]
+
+    def _event(
+        self,
+        kind: Kind,
+        row: int,
+        start: int,
+        stop: int,
+        *,
+        side: Side | None = None,
+        speed_row: int | None = None,
+    ) -> Event:
+        """Describe an event at a row, whose speed is that at `speed_row`, by default the same."""
+        motion, frames = self.motion, self.motion.track.frames
+        frame, own_speed = int(frames[row]), self.own_speed[frames[row]]
+        values: dict[str, float | None] = dict.fromkeys(EVENT_COLUMNS[7:])
+        distance, std = motion.distance[row], motion.distance_std[row]
+        stated = motion.track.columns["distance_m"][row], motion.track.columns["distance_std_m"][row]
+        if np.isfinite(stated).all():  # as labels and tables have it
+            distance, std = stated
+        if std <= _MAX_STD * distance:
+            values |= {"distance_m": distance, "distance_std_m": std}
+            if kind == "headway" and own_speed > _MOVING:
+                values |= {"headway_s": distance / own_speed, "headway_std_s": std / own_speed}
+        speed_row = row if speed_row is None else speed_row
+        if motion.closing_std[speed_row] <= _MAX_SPEED_STD:
+            closing = motion.closing[speed_row], motion.closing_std[speed_row]
+            values |= dict(zip(("closing_mps", "closing_std_mps"), closing))
+            if math.isfinite(own_speed):
+                values["speed_mps"] = own_speed - closing[0]
+        if kind in ("closing", "hard_closing"):
+            values |= {
+                "ttc_s": motion.time_to_collision[row],
+                "ttc_std_s": motion.time_to_collision_std[row],
+            }
+        rounded = {name: None if value is None else round(float(value), 2) for name, value in values.items()}
+        return Event(
+            kind=kind,
+            track_id=motion.track.id,
+            frame=frame,
+            start_frame=int(frames[start]),
+            end_frame=int(frames[stop - 1]),
+            time_s=round(frame / self.fps, 3),
+            side=side,
+            **rounded,
+        )
+
+
+def _rows(mask: Bools, start: int, stop: int) -> NDArray[np.intp]:
+    """Rows of a range where a mask holds."""
+    return np.asarray(start + np.flatnonzero(mask[start:stop]))

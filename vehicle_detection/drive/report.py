@@ -1,0 +1,189 @@
+"""`ReportWriter`: collects the tracks of a video and writes the report page."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import urllib.parse
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from vehicle_detection._common import (
+    UNITS,
+    atomic_write,
+    check_choice,
+    check_integer,
+    check_path,
+    check_sequence,
+    check_suffix,
+    check_type,
+    hide_credentials,
+    is_url,
+)
+from vehicle_detection.drive.events import Event, check_events, find_events
+from vehicle_detection.drive.history import TrackLog
+from vehicle_detection.drive.report_page import TrackPicture, VideoEmbed, render_page
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.video import VideoReport
+
+
+class ReportWriter:
+    """Collect the tracks of a video while it is processed, and write a page that shows them.
+
+    The page is one HTML file that loads nothing from elsewhere: the video and charts of its tracks over time
+    that seek in it, the times of the run, the settings and the model.
+
+    Parameters
+    ----------
+    path, video, source
+        The page to write (.html or .htm), the annotated video (the target of `process_video`) if one is
+        written, and the source video for the title.
+    detector, embed_limit
+        The :class:`VehicleDetector`, for settings and model; and the number of bytes from which on a video is
+        linked instead of embedded: page and video must then be moved together.
+    units
+        ``"metric"`` (m and km/h) or ``"imperial"`` (ft and mph).
+
+    Attributes
+    ----------
+    log
+        `TrackLog` of the frames that were added.
+
+    Raises
+    ------
+    InvalidInputError
+        If the page has another suffix, its folder is missing or read-only, or it is the video or the source
+        itself.
+
+    Examples
+    --------
+    >>> write = ReportWriter("report.html", video="found.mp4", source="drive.mp4")
+    >>> report = process_video("drive.mp4", "found.mp4", detector, on_result=write)  # doctest: +SKIP
+    >>> write.finish(report)  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        video: str | os.PathLike[str] | None = None,
+        source: str | os.PathLike[str] | None = None,
+        detector: Any = None,
+        embed_limit: int = 60_000_000,
+        units: Literal["metric", "imperial"] = "metric",
+    ) -> None:
+        check_choice(units, "units", UNITS)
+        self._units = units
+        given: dict[str, Any] = {"path": path, "video": video, "source": source}
+        for name, value in given.items():
+            # A URL may have longer parts than a path.
+            from_url = name == "source" and isinstance(value, str) and is_url(value)
+            if (value is not None or name == "path") and not from_url:
+                check_path(value, name)
+        self._path = Path(path)
+        check_suffix(self._path, "path", (".html", ".htm"))
+        for name, value in (("video", video), ("source", source)):
+            if value is not None and os.path.realpath(value) == os.path.realpath(self._path):
+                raise InvalidInputError(f"path {self._path} is also the {name}; choose another name")
+        self._video = None if video is None else Path(video)
+        self._source = None if source is None else Path(hide_credentials(os.fspath(source))).name
+        self._source_path = None if source is None else str(Path(os.fspath(source)))
+        self._detector = detector
+        self._embed_limit = check_integer(embed_limit, "embed_limit", low=0)
+        self.log = TrackLog()
+
+    def __call__(self, result: Any) -> None:
+        """Add one frame's result: for ``process_video(..., on_result=...)``."""
+        self.write(result.index, result.time, result.tracks)
+
+    def write(self, index: int, time: float | None, tracks: Iterable[Any]) -> None:
+        """Add the shown tracks of the next frame.
+
+        Parameters
+        ----------
+        index, time, tracks
+            As in `TrackLog.add`.
+
+        Raises
+        ------
+        InvalidInputError
+            As in `TrackLog.add`.
+        """
+        self.log.add(index, time, tracks)
+
+    def finish(
+        self,
+        report: VideoReport,
+        *,
+        events: Iterable[Event] | None = None,
+        pictures: Sequence[TrackPicture] = (),
+    ) -> None:
+        """Write the page, completely or not at all.
+
+        Parameters
+        ----------
+        report
+            What `process_video` returned.
+        events
+            What `find_events` found in `log`; None: they are found here.
+        pictures
+            `TrackPicture` objects to list below the tracks.
+
+        Raises
+        ------
+        InvalidInputError
+            If an argument is malformed, or the folder of the page is missing or read-only.
+        OutputError
+            If the page cannot be written, for example because the disk is full.
+        """
+        check_type(report, "report", VideoReport, "pass what process_video returned")
+        if events is None:
+            camera_of = getattr(self._detector, "camera_of", lambda shape: None)
+            camera, fps = camera_of(report.shape), float(report.fps)
+            own = getattr(self._detector, "own_speed", None)
+            speeds = None if own is None else self.log.own_speeds(own, fps)
+            events = find_events(self.log, fps=fps, shape=report.shape, camera=camera, own_speed_mps=speeds)
+        listed = check_sequence(pictures, "pictures", "TrackPicture")
+        for picture in listed:
+            check_type(picture, "pictures", TrackPicture, "omit them, or pass TrackPicture objects")
+        options = {
+            "events": check_events(events),
+            "video": self._embed(),
+            "source": self._source,
+            "detector": self._detector,
+            "units": self._units,
+            "pictures": listed,
+        }
+        if self._source_path and self._source:  # without its folder, as in the title
+            damage = report.damage.replace(self._source_path, self._source)
+            report = dataclasses.replace(report, damage=damage)
+        pieces = render_page(self.log, report, **options)
+        with (
+            atomic_write(self._path, "path") as part,
+            # A file name may hold bytes that are not UTF-8; they become question marks.
+            part.open("w", encoding="utf-8", errors="replace", newline="\n") as file,
+        ):
+            file.writelines(pieces)
+
+    def _embed(self) -> VideoEmbed | None:
+        if self._video is None:
+            return None
+        if not self._video.is_file():
+            raise InvalidInputError(
+                f"video {self._video} does not exist; call finish after process_video has written it"
+            )
+        size = self._video.stat().st_size
+        # Browsers play the .mov files of `process_video` as MP4.
+        mime_type = "video/x-matroska" if self._video.suffix.lower() == ".mkv" else "video/mp4"
+        link = _relative_url(self._video, self._path) if size > self._embed_limit else None
+        return VideoEmbed(self._video, mime_type, link, size / 1e6)
+
+
+def _relative_url(video: Path, page: Path) -> str:
+    """Return the URL of a video as seen from a page."""
+    try:
+        relative = os.path.relpath(video.resolve(), page.parent.resolve())
+    except ValueError:  # on another drive of Windows
+        return video.resolve().as_uri()
+    return urllib.parse.quote(os.fsencode(relative.replace(os.sep, "/")))

@@ -1,0 +1,410 @@
+"""The report page: data for the template ``report.html.j2``, and its rendering."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import vehicle_detection
+from vehicle_detection._common import ROUGH_DISTANCE, UNITS, Floats, Units, format_with_error, pluralize
+from vehicle_detection.annotator import MAX_SPEED_STD
+from vehicle_detection.drive.counts import VehicleCounts, count_vehicles
+from vehicle_detection.drive.events import KINDS, Event
+from vehicle_detection.drive.history import TrackHistory, TrackLog, bin_means
+from vehicle_detection.drive.report_charts import (
+    TimeAxis,
+    ValueAxis,
+    chart,
+    count_bars,
+    curve,
+    end_labels,
+    event_markers,
+    fraction_bar,
+    gantt,
+)
+from vehicle_detection.drive.report_formatting import format_time, format_value
+from vehicle_detection.heatmap import HeatParams
+from vehicle_detection.training import split_table
+from vehicle_detection.video import VideoReport
+
+_COUNT_SECONDS = (1, 2, 5, 10, 15, 30, 60, 120, 300)  # durations of a bar in the chart of counts
+_JPEG_QUALITY = 82
+_CHUNK = 3 << 18  # bytes; a multiple of 3, so that the chunks' base64 texts can be joined
+
+
+@dataclass(frozen=True)
+class VideoEmbed:
+    """The annotated video on the page, embedded or linked."""
+
+    path: Path
+    mime_type: str
+    link: str | None  # URL relative to the page; None: the video is embedded
+    megabytes: float
+
+    def base64_chunks(self) -> Iterator[str]:
+        """Read the video in pieces, so that it is never in memory as a whole."""
+        with self.path.open("rb") as video:
+            while chunk := video.read(_CHUNK):
+                yield base64.b64encode(chunk).decode("ascii")
+
+
+class TrackPicture(NamedTuple):
+    """A picture of a track, with its frame and a text about it."""
+
+    track: int
+    frame: int
+    image: NDArray[np.uint8]  # (H, W, 3) RGB
+    text: str
+
+    def data_url(self) -> str:
+        """Encode the picture as a JPEG in a URL."""
+        bgr = cv2.cvtColor(self.image, cv2.COLOR_RGB2BGR)
+        _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+        return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
+
+
+class Figure(NamedTuple):
+    """A chart with its caption; without a chart, the note is shown alone."""
+
+    title: str
+    note: str
+    svg: str = ""
+
+
+class Table(NamedTuple):
+    """A table of text cells; the first cell of a row is its header, which may go to a frame."""
+
+    label: str
+    note: str
+    header: Sequence[str]
+    rows: list[list[str]]
+    frames: Sequence[int] = ()  # of the first rows
+
+
+class Group(NamedTuple):
+    """Named values that the reader can unfold, below an optional table."""
+
+    title: str
+    values: Mapping[str, Any]
+    table: Table | None = None
+
+
+def render_page(
+    log: TrackLog,
+    report: VideoReport,
+    *,
+    events: Sequence[Event],
+    video: VideoEmbed | None,
+    source: str | None,
+    detector: Any,
+    units: str = "metric",
+    pictures: Sequence[TrackPicture] = (),
+) -> Iterator[str]:
+    """Render the page in pieces; `detector` may lack settings or a model, which are then left out."""
+    from jinja2 import Environment, StrictUndefined
+
+    axis = TimeAxis(max(report.frames, len(log.counts), 1), float(report.fps))
+    chosen = UNITS[units]
+    # Labels in the video state speeds over ground where the own speed is known.
+    relative = " relative" if getattr(detector, "own_speed", None) is not None else ""
+    tracks = [_in_units(_without_imprecise_speeds(track), chosen) for track in log.histories()]
+    css, script, template = map(_read, ("report.css", "report.js", "report.html.j2"))
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    filters = {"time": format_time, "plural": pluralize, "value": format_value, "hash": _csp_hash}
+    environment.filters |= filters
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
+    return environment.from_string(template).generate(
+        css=css,
+        script=script,
+        source=source,
+        report=report,
+        fps=axis.fps,
+        first_time=log.first_time,
+        units=chosen,
+        notices=_notices(tracks, report, detector),
+        counts=_counts(tracks, log, report, chosen),
+        video=video,
+        tracks=tracks,
+        figures=_figures(tracks, log, events, axis, chosen) if tracks else [],
+        events=events,
+        event_kinds=KINDS,
+        pictures=pictures,
+        minutes=_minute_table(count_vehicles(events, log, fps=axis.fps), axis.fps) if tracks else None,
+        fraction_bar=fraction_bar,
+        settings=_settings(detector, report.shape),
+        model=_model_summary(getattr(detector, "model", None)),
+        version=vehicle_detection.__version__,
+        data=_script_data(tracks, axis)
+        | {"units": [chosen.distance_symbol, f"{chosen.speed_symbol}{relative}"]},
+    )
+
+
+def _read(name: str) -> str:
+    return files("vehicle_detection.drive").joinpath(name).read_text(encoding="utf-8")
+
+
+def _csp_hash(code: str) -> str:
+    """Hash by which the page's content security policy allows its own script or style."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}"
+
+
+def _in_units(track: TrackHistory, units: Units) -> TrackHistory:
+    """Convert distances and speeds, although the names of the columns say SI units."""
+    factors = {"distance_m": units.distance, "distance_std_m": units.distance}
+    factors |= {"speed_mps": units.speed, "speed_std_mps": units.speed}
+    columns = {name: factors.get(name, 1.0) * values for name, values in track.columns.items()}
+    return dataclasses.replace(track, columns=columns)
+
+
+def _notices(tracks: Sequence[TrackHistory], report: VideoReport, detector: Any) -> list[str]:
+    """List what limits the results: damage of the source, dropped frames and an unknown lens."""
+    notices = [f"{report.damage}."] if report.damage else []
+    if report.dropped:
+        verb = "was" if report.dropped == 1 else "were"
+        notices.append(f"{pluralize(report.dropped, 'frame')} of the live source {verb} dropped.")
+    measured = any(np.isfinite(track.columns["distance_m"]).any() for track in tracks)
+    if measured and not getattr(detector, "lens_is_known", True):
+        notices.append("The lens is unknown: distances and speeds may be wrong by a factor of 2 or more.")
+    return notices
+
+
+def _counts(
+    tracks: Sequence[TrackHistory], log: TrackLog, report: VideoReport, units: Units
+) -> dict[str, str]:
+    fps = float(report.fps)
+    counts = {"Vehicles": f"{len(tracks):,}", "Frames": f"{report.frames:,}"}
+    counts |= {
+        "Length": format_time(max(report.frames, len(log.counts)) / fps),
+        "Most at once": str(max(log.counts, default=0)),
+    }
+    if tracks:
+        longest = max(tracks, key=lambda track: len(track.frames))
+        counts["Longest track"] = f"#{longest.id}, {len(longest.frames) / fps:.1f} s"
+    nearest = [(found, track.id) for track in tracks if (found := track.closest_approach(fps))]
+    if nearest:
+        found, track_id = min(nearest, key=lambda each: (each[0].distance_m, each[1]))
+        distance = format_with_error(found.distance_m, found.std_m)
+        counts["Nearest"] = f"{distance} {units.distance_symbol}, #{track_id}"
+    return counts
+
+
+def _minute_table(counts: VehicleCounts, fps: float) -> Table:
+    """List the counts of each minute, and of the whole video."""
+    rows = []
+    for minute in counts.minutes + ((counts.total,) if len(counts.minutes) > 1 else ()):
+        whole = minute is counts.total
+        name = "Total" if whole else format_time(minute.start_s, tenths=False)
+        numbers = minute.met, minute.overtaken, minute.overtaking, minute.passed
+        rows.append([name, *map(str, numbers), f"{minute.mean_in_view:.1f}", str(minute.max_in_view)])
+    note = (
+        "Vehicles that were oncoming, that we overtook, that overtook us, and that we passed although they "
+        "stood or their direction is uncertain; and vehicles in view."
+    )
+    header = (
+        "From", "Oncoming", "Overtaken by us", "Overtook us", "Passed by us", "Mean in view", "Most in view"
+    )  # fmt: skip
+    frames = [round(minute.start_s * fps) for minute in counts.minutes]
+    return Table("Counts by minute", note, header, rows, frames)
+
+
+def _figures(
+    tracks: Sequence[TrackHistory], log: TrackLog, events: Sequence[Event], axis: TimeAxis, units: Units
+) -> list[Figure]:
+    label = f"Bars of {pluralize(len(tracks), 'track')}: when each was shown, as in the table of tracks."
+    distances = [track.columns["distance_m"] for track in tracks]
+    speeds = [bin_means(track.frames, track.columns["speed_mps"], axis.bin_width)[1] for track in tracks]
+    marked = event_markers(events, axis, units, label=f"Markers of {pluralize(len(events), 'event')}.")
+    return [
+        Figure("Tracks", "When each vehicle was shown", gantt(tracks, axis, label=label)),
+        *([Figure("Events", "What the table of events lists", marked)] if events else []),
+        _count_figure(log, axis),
+        _curve_figure("distance", np.concatenate(distances), tracks, axis, units),
+        _curve_figure("relative speed", np.concatenate(speeds), tracks, axis, units),
+    ]
+
+
+def _count_figure(log: TrackLog, axis: TimeAxis) -> Figure:
+    counts = np.array(log.counts, np.int64)
+    seconds = next((each for each in _COUNT_SECONDS if axis.seconds / each <= 300), 600)
+    edges = [0.0]
+    while edges[-1] < axis.frames:  # a frame belongs to the second in which it begins
+        edges.append(min(math.ceil(len(edges) * seconds * axis.fps - 1e-6), axis.frames))
+    heights = [float(counts[int(start) : int(stop)].max(initial=0)) for start, stop in pairwise(edges)]
+    values = ValueAxis.covering(0, max(heights), 70, integers=True, max_steps=3)
+    interval = "each second" if seconds == 1 else f"each {seconds} seconds"
+    label = f"Bars: most vehicles at once in {interval}, from {min(heights):g} to {max(heights):g}."
+    svg = chart(count_bars(heights, edges, axis, values), axis, values, label=label)
+    return Figure("Vehicles", f"Most shown at once in {interval}", svg)
+
+
+def _curve_figure(
+    quantity: str, values: Floats, tracks: Sequence[TrackHistory], axis: TimeAxis, units: Units
+) -> Figure:
+    """Lines of the distance or of the relative speed of each track."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return Figure(quantity.capitalize(), f"No {quantity} is known.")
+    low, high = float(known.min()), float(known.max())
+    if quantity == "distance":
+        name, std = "distance_m", "distance_std_m"
+        extent = f"{low:.0f} to {high:.0f} {units.distance_name}. The table of tracks lists the nearest ones."
+        note = f"{units.distance_name.capitalize()} along the road; the band is one standard error"
+    else:
+        name, std, extent = "speed_mps", None, f"{low:.0f} to {high:.0f} {units.speed_symbol}."
+        note = (
+            f"{units.speed_name.capitalize()} relative to the camera, above 0 when moving away; standard "
+            f"error at most {units.speed * MAX_SPEED_STD:.0f} {units.speed_symbol}"
+        )
+    # The band around a line belongs to it.
+    edges = [track.columns[name] + track.columns[std] for track in tracks] if std else []
+    top = max([high, *(float(np.nanmax(each)) for each in edges if np.isfinite(each).any())])
+    value_axis = ValueAxis.covering(min(low, 0.0), max(top, 0.0), 150)
+    curves = "".join(curve(track, name, axis, value_axis, std=std) for track in tracks)
+    ends = end_labels(tracks, name, axis, value_axis)
+    label = f"Lines: {quantity} of each track, from {extent}"
+    svg = chart(curves, axis, value_axis, label=label, track_labels=ends)
+    return Figure(quantity.capitalize(), note, svg)
+
+
+def _without_imprecise_speeds(track: TrackHistory) -> TrackHistory:
+    """Hide speeds with a large standard error, as in the video."""
+    imprecise = track.columns["speed_std_mps"] > MAX_SPEED_STD
+    speeds = np.where(imprecise, np.nan, track.columns["speed_mps"])
+    return dataclasses.replace(track, columns={**track.columns, "speed_mps": speeds})
+
+
+def _script_data(tracks: Sequence[TrackHistory], axis: TimeAxis) -> dict[str, Any]:
+    """Values that the script shows for each frame: numbers only."""
+    listed = []
+    for track in tracks:
+        first, last = track.first // axis.bin_width, track.last // axis.bin_width
+        points: dict[str, list[float | None]] = {}
+        for key, name in (("distance", "distance_m"), ("speed", "speed_mps")):
+            means = dict(zip(*bin_means(track.frames, track.columns[name], axis.bin_width)))
+            points[key] = [round(float(means[n]), 1) if n in means else None for n in range(first, last + 1)]
+        rough = track.columns["distance_std_m"] > ROUGH_DISTANCE * track.columns["distance_m"]
+        shares = dict(zip(*bin_means(track.frames, rough.astype(np.float64), axis.bin_width)))
+        points["rough"] = [int(shares.get(n, 0.0) > 0.5) for n in range(first, last + 1)]
+        values = {"id": track.id, "color": track.color, "spans": track.spans(), "first": first}
+        listed.append(values | points)
+    return {"fps": axis.fps, "frames": axis.frames, "step": axis.bin_width, "tracks": listed}
+
+
+def _settings(detector: Any, shape: tuple[int, ...]) -> list[Group]:
+    """Parameters of a detector, a group for each dataclass of them."""
+    search, regions, tracks = (
+        getattr(detector, name, None) for name in ("search_params", "region_params", "track_params")
+    )
+    if hasattr(detector, "search_params_of"):
+        search = detector.search_params_of(shape)
+    bands = getattr(search, "bands", ())
+    groups = {"Search": search}
+    if isinstance(regions, HeatParams):
+        groups["Regions (heat map)"] = regions
+    elif bands:  # without bands, the model itself predicts boxes
+        groups["Regions (fitted boxes)"] = regions
+    groups["Tracks"] = tracks
+    if hasattr(detector, "camera_of"):
+        title = "Camera" if getattr(detector, "lens_is_known", False) else "Camera (assumed)"
+        groups[title] = detector.camera_of(shape)
+    found = []
+    for title, params in groups.items():
+        if dataclasses.is_dataclass(params):
+            names = (each.name for each in dataclasses.fields(params))
+            values = {name: getattr(params, name) for name in names if name not in ("bands", "shape")}
+            found.append(Group(title, values, _band_table(bands) if bands and params is search else None))
+    return found
+
+
+def _band_table(bands: Sequence[Any]) -> Table:
+    def number(value: float) -> str:
+        return format_value(float(round(value, 1)))
+
+    rows = []
+    for band in bands:
+        size = "\N{NO-BREAK SPACE}\N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}".join(map(number, band.window))
+        y, x = (" to ".join(map(number, each)) for each in (band.y, band.x))
+        rows.append([size, y, x, ", ".join(f"{fraction:.3g}" for fraction in band.overlap)])
+    note = (
+        "Pixels of a frame 1280 wide; rows count from the horizon, columns are fractions of the width, and "
+        "overlaps fractions of a window."
+    )
+    return Table("Search bands", note, ("Window", "Rows", "Columns", "Overlap"), rows)
+
+
+def _model_summary(model: Any) -> dict[str, Any] | None:
+    """Describe a model by its summary and metadata; None for a model of another library."""
+    if not hasattr(model, "open_search"):
+        return None
+    title, facts = model.summary()
+    metadata: Mapping[str, Any] = model.metadata
+    groups = [Group("Details", facts)]
+    for name, values in metadata.items():
+        shown = dict(values) if isinstance(values, Mapping) else {name: values}
+        if name == "metrics":
+            shown = {key: value for key, value in shown.items() if key not in ("splits", "left_out")}
+        groups.append(Group(name.capitalize(), shown))
+    tables = [_split_table(_scores(metadata, "splits")), _left_out_table(_scores(metadata, "left_out"))]
+    return {
+        "title": title,
+        "license": _license(metadata),
+        "tables": [table for table in tables if table.rows],
+        "groups": [group for group in groups if group.values],
+    }
+
+
+def _scores(metadata: Mapping[str, Any], name: str) -> dict[str, Mapping[str, Any]]:
+    """Scores of a model by data set; a model file may hold anything, and other values are ignored."""
+    metrics = metadata.get("metrics")
+    scores = metrics.get(name) if isinstance(metrics, Mapping) else None
+    listed = scores.items() if isinstance(scores, Mapping) else ()
+    return {key: values for key, values in listed if isinstance(values, Mapping)}
+
+
+def _split_table(scores: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Accuracy of a classifier of patches on each split."""
+    titles, rows = split_table(scores)
+    note = "Accuracy on patches that were not used for training; vehicles in whole frames are another task."
+    return Table("Accuracy of the model", note, tuple(map(_heading, titles)), rows)
+
+
+def _left_out_table(scores: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Scores on frames of sources that were left out of training."""
+    columns = ("f1", "average_precision", "precision", "recall", "mean_iou")
+
+    def cell(value: object) -> str:
+        return f"{value:.3f}" if isinstance(value, (int, float)) else str(value)
+
+    rows = [[name, *(cell(values.get(key, "")) for key in columns)] for name, values in scores.items()]
+    note = "Single frames of sources that were left out of training, IoU 0.5."
+    return Table("Quality of the model", note, ("Frames", *map(_heading, columns)), rows)
+
+
+def _heading(name: str) -> str:
+    return name.replace("_", " ").capitalize().replace("iou", "IoU")
+
+
+def _license(metadata: Mapping[str, Any]) -> str:
+    """Terms of a model, which are those of its training data."""
+    data = metadata.get("data")
+    sources = data.get("sources") if isinstance(data, Mapping) else None
+    if isinstance(sources, Mapping) and any(name.startswith(("GTI", "KITTI")) for name in sources):
+        return (
+            "License: the model is trained on patches from the GTI vehicle image database and the KITTI "
+            "benchmark, both CC BY-NC-SA 3.0, and inherits their terms: non-commercial use, with attribution."
+        )
+    return "License: the model inherits the terms of the data it was trained on."

@@ -1,0 +1,229 @@
+"""Subtitles that say what a video shows in each second: vehicles, the nearest one, own speed and events."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from vehicle_detection._common import (
+    UNITS,
+    Floats,
+    Units,
+    atomic_write,
+    check_choice,
+    check_number,
+    check_suffix,
+    check_type,
+    pluralize,
+)
+from vehicle_detection.annotator import MAX_SPEED_STD
+from vehicle_detection.drive.events import Event, check_events
+from vehicle_detection.drive.history import TrackHistory, TrackLog
+from vehicle_detection.drive.own_speed import OwnSpeed
+
+SUBTITLE_SUFFIXES = (".srt", ".ass")
+"""Suffixes of files of subtitles."""
+
+# Seconds for which an event is shown.
+_EVENT_SECONDS = 3
+_ASS_HEADER = """\
+[Script Info]
+ScriptType: v4.00+
+WrapStyle: 0
+PlayResX: 1280
+PlayResY: 720
+
+[V4+ Styles]
+Format: Name, Fontname, Fontsize, PrimaryColour, SecondaryColour, OutlineColour, BackColour, Bold, Italic, \
+Underline, StrikeOut, ScaleX, ScaleY, Spacing, Angle, BorderStyle, Outline, Shadow, Alignment, \
+MarginL, MarginR, MarginV, Encoding
+Style: Default,Arial,26,&H00FFFFFF,&H00FFFFFF,&H00000000,&H80000000,0,0,0,0,100,100,0,0,1,2,0,7,16,16,12,1
+
+[Events]
+Format: Layer, Start, End, Style, Name, MarginL, MarginR, MarginV, Effect, Text
+"""
+
+
+@dataclass(frozen=True)
+class _Nearest:
+    """Medians of a track in one second."""
+
+    id: int
+    distance_m: float
+    distance_std_m: float | None
+    speed_mps: float | None
+
+
+def write_subtitles(
+    log: TrackLog,
+    path: str | os.PathLike[str],
+    *,
+    fps: float,
+    events: Iterable[Event] = (),
+    own_speed: OwnSpeed | None = None,
+    units: Literal["metric", "imperial"] = "metric",
+) -> int:
+    """Write what a video shows as subtitles, second by second; the file appears only when it is complete.
+
+    A subtitle states the own speed if it is known, the largest number of vehicles at once, the nearest one
+    with its distance and speed, and for three seconds each event. Players load a file beside the video with
+    the same name.
+
+    Parameters
+    ----------
+    log, fps
+        The `TrackLog` of the video, and its frame rate.
+    path
+        ``.srt`` (SubRip) or ``.ass`` (Advanced SubStation Alpha, in the upper left corner).
+    events
+        What `find_events` found in `log`.
+    own_speed
+        Speed of the camera's vehicle over the time of the source. Where it is known, speeds are those over
+        ground; elsewhere they are relative to the camera.
+    units
+        ``"metric"`` (m and km/h) or ``"imperial"`` (ft and mph).
+
+    Returns
+    -------
+    int
+        Number of subtitles; seconds with the same text share one.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed, the suffix is another one, or the folder is missing or read-only.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> log = TrackLog()
+    >>> for frame in range(50):
+    ...     log.add(frame, frame / 25, [])
+    >>> file = Path(tempfile.mkdtemp()) / "found.srt"
+    >>> write_subtitles(log, file, fps=25, own_speed=OwnSpeed.constant(25.0))
+    1
+    >>> print(file.read_text().rstrip())
+    1
+    00:00:00,000 --> 00:00:02,000
+    own speed 90 km/h
+    no vehicle
+    """
+    check_type(log, "log", TrackLog, "pass the one that process_video filled")
+    target = check_suffix(path, "path", SUBTITLE_SUFFIXES)
+    rate = check_number(fps, "fps", above=0, high=1e6)
+    if own_speed is not None:
+        check_type(own_speed, "own_speed", OwnSpeed, "pass what read_own_speed returns")
+    check_choice(units, "units", UNITS)
+    listed = check_events(events)
+    cues = list(_merge(_second_texts(log, rate, listed, own_speed, UNITS[units])))
+    end = len(log.counts) / rate
+    with atomic_write(target, "path") as part, part.open("w", encoding="utf-8", newline="\n") as file:
+        if target.suffix.lower() == ".ass":
+            file.write(_ASS_HEADER)
+        for number, (start, stop, lines) in enumerate(cues, start=1):
+            last = min(stop, end)
+            if target.suffix.lower() == ".ass":
+                times, text = f"{_ass_time(start)},{_ass_time(last)}", r"\N".join(lines)
+                file.write(f"Dialogue: 0,{times},Default,,0,0,0,,{text}\n")
+            else:
+                text = "\n".join(lines)
+                file.write(f"{number}\n{_srt_time(start)} --> {_srt_time(last)}\n{text}\n\n")
+    return len(cues)
+
+
+def _second_texts(
+    log: TrackLog, fps: float, events: list[Event], own_speed: OwnSpeed | None, units: Units
+) -> Iterator[tuple[str, ...]]:
+    """Yield the lines for each second of a video."""
+    counts = np.array(log.counts, np.int64)
+    seconds = math.ceil(len(counts) / fps - 1e-9)
+    nearest = _nearest_tracks(log.histories(), fps)
+    # In the middle of each second.
+    frames = np.minimum((np.arange(seconds) + 0.5) * fps, len(counts) - 1).astype(np.intp)
+    own = np.full(seconds, np.nan) if own_speed is None else log.own_speeds(own_speed, fps)[frames]
+    shown: defaultdict[int, list[Event]] = defaultdict(list)
+    for event in events:
+        for second in range(int(event.time_s), int(event.time_s) + _EVENT_SECONDS):
+            shown[second].append(event)
+    for second in range(seconds):
+        first, last = (math.ceil(edge * fps - 1e-9) for edge in (second, second + 1))
+        frame_second = second
+        if first == last:  # the frame of an earlier second is still shown
+            first, frame_second = first - 1, math.floor((first - 1) / fps + 1e-9)
+        speed = None if np.isnan(own[second]) else float(own[second])
+        lines = [] if speed is None else [f"own speed {units.speed_text(speed, None, signed=False)}"]
+        lines.append(
+            _vehicles(int(counts[first:last].max(initial=0)), nearest.get(frame_second), speed, units)
+        )
+        lines += [event.text(units, with_time=False) for event in shown[second]]
+        yield tuple(lines)
+
+
+def _vehicles(count: int, nearest: _Nearest | None, own_mps: float | None, units: Units) -> str:
+    """Describe the vehicles of a second."""
+    text = pluralize(count, "vehicle") if count else "no vehicle"
+    if nearest is None:
+        return text
+    text += f", nearest #{nearest.id}: {units.distance_text(nearest.distance_m, nearest.distance_std_m)}"
+    if nearest.speed_mps is None:
+        return text
+    if own_mps is None:
+        return f"{text}, {units.speed_text(nearest.speed_mps, None)} relative"
+    over_ground = own_mps + nearest.speed_mps
+    oncoming = ", oncoming" * (over_ground < -MAX_SPEED_STD)
+    return f"{text}, {units.speed_text(abs(over_ground), None, signed=False)}{oncoming}"
+
+
+def _nearest_tracks(tracks: Iterable[TrackHistory], fps: float) -> dict[int, _Nearest]:
+    """Return the track with the smallest median distance in each second."""
+    found: dict[int, _Nearest] = {}
+    for track in tracks:
+        distances, known = track.columns["distance_m"], np.isfinite(track.columns["distance_m"])
+        precise = track.columns["speed_std_mps"] <= MAX_SPEED_STD
+        seconds = np.floor(track.frames / fps + 1e-9).astype(np.int64)
+        for second in np.unique(seconds[known]).tolist():
+            rows = known & (seconds == second)
+            distance = float(np.median(distances[rows]))
+            if second not in found or distance < found[second].distance_m:
+                std = _median(track.columns["distance_std_m"][rows])
+                speed = _median(track.columns["speed_mps"][rows & precise])
+                found[second] = _Nearest(track.id, distance, std, speed)
+    return found
+
+
+def _median(values: Floats) -> float | None:
+    """Median of the known values; None if none is known."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else None
+
+
+def _merge(texts: Iterable[tuple[str, ...]]) -> Iterator[tuple[int, int, tuple[str, ...]]]:
+    """Yield first and last edge, in seconds, and lines of each run of seconds with the same lines."""
+    start, previous = 0, None
+    number = -1
+    for number, lines in enumerate(texts):
+        if previous is not None and lines != previous:
+            yield start, number, previous
+            start = number
+        previous = lines
+    if previous is not None:
+        yield start, number + 1, previous
+
+
+def _srt_time(seconds: float) -> str:
+    total = round(seconds * 1000)
+    hours, minutes = divmod(total // 60_000, 60)
+    return f"{hours:02d}:{minutes:02d}:{total // 1000 % 60:02d},{total % 1000:03d}"
+
+
+def _ass_time(seconds: float) -> str:
+    total = round(seconds * 100)
+    hours, minutes = divmod(total // 6000, 60)
+    return f"{hours}:{minutes:02d}:{total // 100 % 60:02d}.{total % 100:02d}"
