@@ -1,0 +1,481 @@
+"""Annotated frames: tracks with labels, the bird's-eye view, blurred vehicles, diagnostics."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.drawing.cases import blank, changed_box, track
+from vehicle_detection.annotator import (
+    LABEL_FIELDS,
+    Annotator,
+    BirdsEyePanel,
+    DrawParams,
+    Trails,
+    draw_diagnostics,
+    draw_tracks,
+    road_position,
+    track_color,
+    track_fields,
+)
+from vehicle_detection.boxes import Detections
+from vehicle_detection.camera import Camera
+from vehicle_detection.drawing import TRACK_COLORS, blur_boxes, draw_text, text_size
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.scenes import SceneVehicle, render_scene
+from vehicle_detection.tracking import FrameResult
+
+
+def test_labels_become_a_tuple():
+    assert DrawParams(labels=["id", "std"]).labels == ("id", "std")
+    assert DrawParams(labels="id").labels == ("id",)
+    assert DrawParams(labels=()).labels == ()
+    assert DrawParams(labels=LABEL_FIELDS).labels == LABEL_FIELDS
+
+
+SIZES = [(360, 480), (720, 1280), (1920, 1080), (2160, 3840)]
+
+
+class TestTracks:
+    def test_draws_on_a_copy(self):
+        image = blank()
+        image.setflags(write=False)
+        drawn = draw_tracks(image, [track()])
+        np.testing.assert_array_equal(image, blank())
+        assert drawn.flags.writeable
+
+    def test_box_and_label_have_the_tracks_color(self):
+        drawn = draw_tracks(blank(), [track(id=3)])
+        assert tuple(drawn[489, 650].tolist()) == TRACK_COLORS[2]
+        assert tuple(drawn[399, 601].tolist()) == TRACK_COLORS[2]
+
+    def test_colors_follow_the_id_and_repeat_after_the_palette(self):
+        count = len(TRACK_COLORS)
+        assert [track_color(track(id=1 + k)) for k in range(count)] == list(TRACK_COLORS)
+        assert track_color(track(id=1 + count)) == TRACK_COLORS[0]
+        assert track_color(track(id=0, state="tentative")) not in TRACK_COLORS
+
+    def test_color_blind_viewers_can_tell_the_colors_apart(self):
+        """Machado et al. (2009), full protanopia, deuteranopia and tritanopia."""
+        simulations = [
+            [
+                [0.152286, 1.052583, -0.204868],
+                [0.114503, 0.786281, 0.099216],
+                [-0.003882, -0.048116, 1.051998],
+            ],
+            [
+                [0.367322, 0.860646, -0.227968],
+                [0.280085, 0.672501, 0.047413],
+                [-0.011820, 0.042940, 0.968881],
+            ],
+            [
+                [1.255528, -0.076749, -0.178779],
+                [-0.078411, 0.930809, 0.147602],
+                [0.004733, 0.691367, 0.303900],
+            ],
+        ]
+        linear = (np.array(TRACK_COLORS) / 255) ** 2.2
+        for matrix in simulations:
+            simulated = np.clip(linear @ np.array(matrix).T, 0, 1) ** (1 / 2.2) * 255
+            nearest = min(np.linalg.norm(a - b) for a, b in itertools.combinations(simulated, 2))
+            assert nearest > 25
+
+    def test_tracks_that_are_not_shown_are_not_drawn(self):
+        drawn = draw_tracks(blank(), [track(shown=False), track(id=0, state="tentative", shown=False)])
+        np.testing.assert_array_equal(drawn, blank())
+
+    def test_a_coasting_track_is_dashed(self):
+        image, box = blank(), (600, 400, 700, 490)
+        solid = draw_tracks(image, [track(box)], labels=())
+        dashed = draw_tracks(image, [track(box, state="coasting", misses=1)], labels=())
+        assert changed_box(dashed, image) == list(box)
+        drawn = (dashed != image).any(axis=2)
+        assert not drawn[(solid == image).all(axis=2)].any()
+        for line in (drawn[400, 600:700], drawn[489, 600:700], drawn[400:490, 600], drawn[400:490, 699]):
+            assert 0.35 < line.mean() < 0.75
+            assert line[0]
+            assert line[-1]
+            assert np.diff(line.astype(int)).clip(0).sum() >= 4
+
+    @pytest.mark.parametrize("side", [1, 2, 3, 5, 9])
+    def test_a_tiny_coasting_track_is_visible(self, side):
+        image, box = blank(), (600, 400, 600 + side, 400 + side)
+        drawn = draw_tracks(image, [track(box, state="coasting")], labels=())
+        assert changed_box(drawn, image) == list(box)
+
+    @pytest.mark.parametrize(("height", "width"), SIZES)
+    def test_the_label_grows_with_the_image_and_lies_above_its_box(self, height, width):
+        image = blank(height, width)
+        box = np.array([0.4, 0.5, 0.5, 0.6]) * [width, height, width, height]
+        left, top, _, bottom = changed_box(draw_tracks(image, [track(box)], labels=("id",)), image)
+        label = round(box[1]) - top
+        assert left == round(box[0])
+        assert bottom == round(box[3])
+        assert 0.012 < label / np.sqrt(height * width) < 0.05
+        assert label >= 12
+
+    @pytest.mark.parametrize(("height", "width"), SIZES)
+    @pytest.mark.parametrize("corner", [(0, 0), (0, 1), (1, 0), (1, 1)])
+    def test_labels_stay_inside_the_image(self, height, width, corner):
+        side_x, side_y = width // 12, height // 12
+        sizes = []
+        for x, y in (
+            (width // 2, height // 2),
+            (corner[0] * (width - side_x), corner[1] * (height - side_y)),
+        ):
+            tracks = [track((x, y, x + side_x, y + side_y))]
+            bare = draw_tracks(blank(height, width), tracks, labels=())
+            x1, y1, x2, y2 = changed_box(draw_tracks(blank(height, width), tracks), bare)
+            sizes.append((x2 - x1, y2 - y1))
+        # A label has the color of its box's lines, so a part over them does not differ.
+        line = max(2, round(np.sqrt(height * width) / 320))
+        assert np.abs(np.subtract(*sizes)).max() <= line
+
+    def test_labels_of_neighbors_hide_neither_each_other_nor_a_vehicle(self):
+        image = blank()
+        pair = [track((600, 400, 700, 490)), track((610, 402, 712, 495), id=2)]
+        bare = draw_tracks(image, pair, labels=())
+        areas = [
+            int((draw_tracks(image, [one]) != draw_tracks(image, [one], labels=())).any(axis=2).sum())
+            for one in pair
+        ]
+        changed = (draw_tracks(image, pair) != bare).any(axis=2)
+        assert int(changed.sum()) > 0.9 * sum(areas)
+        assert not changed[402:490, 610:700].any()
+
+    def test_the_line_width_is_given_or_grows_with_the_image(self):
+        for width in (1, 5):
+            drawn = draw_tracks(blank(), [track()], labels=(), line_width=width)
+            assert int((drawn[450, 600:650] != 90).any(axis=1).sum()) == width
+        widths = [
+            int((draw_tracks(blank(*shape), [track((200, 100, 400, 300))], labels=())[200, 200:300] != 90)
+                .any(axis=1).sum())
+            for shape in SIZES
+        ]  # fmt: skip
+        assert widths == sorted(widths)
+        assert widths[0] == 2
+
+    def test_colors_by_distance_run_from_near_to_far(self):
+        near, middle, far, unknown = (
+            track_color(track(distance_m=distance), "distance") for distance in (3.0, 20.0, 80.0, None)
+        )
+        assert near == TRACK_COLORS[5]
+        assert middle == TRACK_COLORS[0]
+        assert far == TRACK_COLORS[1]
+        assert unknown not in TRACK_COLORS
+        between = track_color(track(distance_m=27.0), "distance")
+        assert TRACK_COLORS[0][1] < between[1] < TRACK_COLORS[3][1]
+        drawn = draw_tracks(blank(), [track(distance_m=3.0)], color_by="distance")
+        assert tuple(drawn[489, 650].tolist()) == TRACK_COLORS[5]
+
+    def test_near_vehicles_are_drawn_over_far_ones(self):
+        near, far = track((600, 400, 700, 500)), track((650, 380, 750, 470), id=2)
+        for order in ([near, far], [far, near]):
+            drawn = draw_tracks(blank(), order, labels=())
+            assert tuple(drawn[401, 670].tolist()) == TRACK_COLORS[0]
+            assert tuple(drawn[450, 698].tolist()) == TRACK_COLORS[0]
+
+    @settings(max_examples=40)
+    @given(
+        st.lists(st.tuples(*[st.floats(-3000, 3000)] * 4), max_size=4),
+        st.integers(1, 300),
+        st.integers(1, 300),
+        st.floats(0, 2),
+    )
+    def test_tracks_may_lie_partly_outside_the_image(self, corners, height, width, time_since_update):
+        image = blank(height, width)
+        tracks = [
+            track([min(a, c), min(b, d), max(a, c), max(b, d)], id=index, time_since_update=time_since_update)
+            for index, (a, b, c, d) in enumerate(corners, 1)
+        ]
+        drawn = draw_tracks(image, tracks, labels=LABEL_FIELDS)
+        assert drawn.shape == image.shape
+        assert drawn.dtype == np.uint8
+
+
+def track_text(*arguments, **options):
+    return "  ".join(track_fields(*arguments, **options))
+
+
+class TestText:
+    def test_shows_the_requested_and_known_fields(self):
+        assert track_text(track(), ("id", "distance", "speed")) == "#1  24 m  -6 km/h"
+        assert track_text(track(), ("distance", "std")) == "24 ± 2 m"
+        assert track_text(track(), LABEL_FIELDS) == "#1  1.2  24 ± 2 m  -6 ± 2 km/h"
+        assert track_text(track(), ()) == ""
+        assert track_text(track(), ("distance", "speed"), "imperial") == "77 ft  -4 mph"
+        assert track_text(track(confidence=0.876), ("score",)) == "88%"
+        assert track_text(track(distance_std_m=6.0), ("distance",)) == "~24 m"
+        unknown = track(distance_m=None, distance_std_m=None, speed_mps=None, speed_std_mps=None)
+        assert track_text(unknown, LABEL_FIELDS) == "#1  1.2"
+
+    def test_the_own_speed_gives_speeds_over_ground(self):
+        assert track_text(track(), ("speed",), own_mps=25.0) == "84 km/h"
+        assert track_text(track(speed_mps=-45.0), ("speed", "std"), "imperial", 25.0) == "45 ± 1 mph"
+
+    def test_the_font_has_a_plus_minus_sign(self):
+        drawn = []
+        for text in ("+", "±"):
+            image = blank(40, 60)
+            draw_text(image, [text], 5, 5, 1.0, (255, 255, 255))
+            drawn.append((image != 90).any(axis=2))
+        assert drawn[1][drawn[0]].all()
+        assert drawn[1].sum() > drawn[0].sum()
+        assert text_size(["±"], 1.0) == text_size(["+"], 1.0)
+
+
+class TestDrawer:
+    """What is remembered from frame to frame."""
+
+    def test_a_frame_drawn_again_is_drawn_alike(self):
+        for panel in ("none", "corner", "side"):
+            drawer = Annotator(DrawParams(panel=panel))
+            drawer.draw_tracks(blank(), [track((580, 400, 680, 490), distance_m=30.0)], time=0.0)
+            first, again = (drawer.draw_tracks(blank(), [track()], time=0.04) for _ in range(2))
+            np.testing.assert_array_equal(first, again)
+
+    def test_the_first_frame_is_that_of_draw_tracks(self):
+        tracks = [track(), track((650, 380, 750, 470), id=2, state="coasting")]
+        np.testing.assert_array_equal(
+            Annotator().draw_tracks(blank(), tracks, time=3.0), draw_tracks(blank(), tracks)
+        )
+
+    def test_an_earlier_frame_starts_anew(self):
+        drawer = Annotator(DrawParams(panel="corner"))
+        first = drawer.draw_tracks(blank(), [track()], time=1.0)
+        for time in (1.1, 1.3, 1.6):
+            drawer.draw_tracks(blank(), [track(distance_m=23.6 + 10 * time)], time=time)
+        np.testing.assert_array_equal(drawer.draw_tracks(blank(), [track()], time=1.0), first)
+
+    def test_frames_between_two_searches_are_dashed_like_the_last_searched_one(self):
+        """A predicted box of a vehicle that the last search has found is not dashed."""
+        solid, dashed = (draw_tracks(blank(), [track(state=state)]) for state in ("confirmed", "coasting"))
+        drawer = Annotator()
+        for state, expected in (("confirmed", solid), ("coasting", dashed)):
+            np.testing.assert_array_equal(
+                drawer.draw_tracks(blank(), [track(state=state)], time=0.0), expected
+            )
+            between = drawer.draw_tracks(blank(), [track(state="coasting")], time=0.0, searched=False)
+            np.testing.assert_array_equal(between, expected)
+
+
+SHAPE = (720, 1280, 3)
+CAMERA = Camera(focal_px=1000.0, horizon_px=400.0)
+SIDE = DrawParams(panel="side", labels=())
+
+
+class TestPosition:
+    @pytest.mark.parametrize("distance", [12.0, 40.0])
+    @pytest.mark.parametrize("lateral", [-3.6, 0.8, 3.6])
+    def test_of_rendered_vehicles(self, distance, lateral):
+        """From true boxes and distances: within 0.35 m, a tenth of a lane."""
+        vehicle = SceneVehicle(distance_m=distance, lateral_m=lateral, kind="estate", color="white")
+        scene = render_scene(shape=(360, 640), vehicles=[vehicle], lane=1)
+        (truth,) = scene.truth
+        known = track(truth.box, distance_m=distance, distance_std_m=1.0)
+        position = road_position(known, scene.camera, scene.image.shape)
+        assert position.distance_m == distance
+        assert abs(position.lateral_m - lateral) < 0.35
+
+    def test_where_the_frame_truncates_the_near_end(self):
+        """The visible far end of the side gives the position: here 4.5 m behind the near end, at 150 px."""
+        known = track((790, 380, 1280, 600), distance_m=4.0, distance_std_m=0.5)
+        position = road_position(known, CAMERA, SHAPE)
+        assert position.lateral_m == pytest.approx(0.150 * 8.5 + 0.9)
+        mirrored = track((0, 380, 490, 600), distance_m=4.0, distance_std_m=0.5)
+        assert road_position(mirrored, CAMERA, SHAPE).lateral_m == pytest.approx(-(0.150 * 8.5 + 0.9))
+
+    def test_a_whole_box_of_a_fisheye_lens_is_not_truncated(self):
+        camera = Camera.for_frame(SHAPE, lens="fisheye-120")
+        camera = dataclasses.replace(camera, vehicle_length_m=9.0)
+        known = track((761, 380, 1147, 600), distance_m=4.0, distance_std_m=0.5)
+        assert road_position(known, camera, SHAPE).lateral_m == pytest.approx(3.5, abs=0.1)
+
+    def test_the_error_is_larger_along_the_ray(self):
+        position = road_position(track((600, 400, 680, 460), distance_std_m=2.0), CAMERA, SHAPE)
+        assert position.radial_std_m == pytest.approx(2.0)
+        assert 0.05 < position.tangential_std_m < 0.3
+
+    def test_is_unknown_without_a_distance(self):
+        assert road_position(track(distance_m=None, distance_std_m=None), CAMERA, SHAPE) is None
+
+
+def test_trails_cover_a_time_and_drop_lost_tracks():
+    trails = Trails()
+    for step in range(100):
+        result = trails.update(step / 25, {1: (step, 10), 2: None})
+    times = [time for time, _ in result[1]]
+    assert times == sorted(times)
+    assert 3.96 - 1.5 <= times[0] < 3.96 - 1.3
+    assert len(times) <= 20
+    assert not result[2]
+    assert trails.update(4.0, {2: None}).keys() == {2}
+
+
+class TestPanel:
+    @pytest.mark.parametrize(
+        "shape", [(720, 1280, 3), (1080, 1919, 3), (1920, 1080, 3), (270, 480, 3), (4, 5, 3)]
+    )
+    def test_beside_the_frame(self, shape):
+        drawer, image = Annotator(DrawParams(panel="side"), camera=CAMERA), blank(*shape[:2])
+        drawn = drawer.draw_tracks(image, [track()])
+        assert drawn.shape == drawer.output_shape(shape)
+        assert drawn.shape[0] == shape[0]
+        assert drawn.shape[1] % 2 == 0
+        plain = Annotator().draw_tracks(image, [track()])
+        np.testing.assert_array_equal(drawn[:, : shape[1]], plain)
+        assert Annotator().output_shape(shape) == shape
+
+    def test_in_the_corner(self):
+        drawn = Annotator(DrawParams(panel="corner", labels=()), camera=CAMERA).draw_tracks(blank(), [])
+        left, top, right, bottom = changed_box(drawn, blank())
+        assert (top, right) == (0, 1280)
+        assert (bottom, right - left) == BirdsEyePanel.corner_size(SHAPE)
+        assert bottom < 0.45 * 720
+
+    def test_distances_in_feet(self):
+        """Lines at 75, 150 and 225 ft instead of 20, 40 and 60 m."""
+        drawn = Annotator(DrawParams(panel="side", labels=(), units="imperial")).draw_tracks(blank(), [])
+        lines = [round((80 - feet * 0.3048) * 720 / 86) for feet in (75, 150, 225)]
+        rows = (drawn[:, -4:] == drawn[lines[0], -4:]).all(axis=(1, 2))
+        assert np.flatnonzero(rows).tolist() == sorted(lines)
+
+    def test_labels_stay_outside_the_corner(self):
+        _, width = BirdsEyePanel.corner_size(SHAPE)
+        left = 1280 - width
+        near_corner = track((left - 40, 320, left + 60, 400))
+        drawn, empty = (
+            Annotator(DrawParams(panel="corner"), camera=CAMERA).draw_tracks(blank(), tracks)
+            for tracks in ([near_corner], [])
+        )
+        changed = (drawn != empty).any(axis=2)
+        color = (drawn[:300, left:] == TRACK_COLORS[0]).all(axis=2) & changed[:300, left:]
+        assert color.sum() < 400  # the vehicle in the view, no label
+
+    def test_numbers_stay_in_the_view(self):
+        """At each border; a small view has no room for numbers."""
+        options = {"distance_std_m": 0.1, "speed_mps": None}
+        boxes = {79.0: (600, 400, 680, 470), 20.0: (1000, 400, 1080, 470), 21.0: (200, 400, 280, 470)}
+        for distance, box in boxes.items():
+            tracks = [track(box, id=8, distance_m=distance, **options)]
+            drawn = Annotator(SIDE, camera=CAMERA).draw_tracks(blank(), tracks)
+            empty = Annotator(SIDE, camera=CAMERA).draw_tracks(blank(), [])
+            white = ((drawn == 235).all(axis=2) & (empty != 235).any(axis=2))[:, 1280:]
+            rows, columns = np.nonzero(white)
+            assert np.ptp(rows) >= 8
+            assert np.ptp(columns) >= 4
+        image = blank(240, 320)
+        small = [
+            Annotator(DrawParams(panel="corner", labels=())).draw_tracks(image, each) for each in (tracks, [])
+        ]
+        assert ((small[0] == 235).all(axis=2) & (small[1] != 235).any(axis=2)).sum() == 0
+
+    def test_a_vehicle_is_at_its_place(self):
+        """A vehicle in the own lane: in the middle, and the farther the higher."""
+        rows = []
+        for distance in (10.0, 30.0, 60.0):
+            ahead = track((600, 400, 680, 470), distance_m=distance, distance_std_m=0.1, speed_mps=None)
+            drawn = Annotator(SIDE, camera=CAMERA).draw_tracks(blank(), [ahead])
+            y, x = np.nonzero((drawn[:, 1280:] == TRACK_COLORS[0]).all(axis=2))
+            assert abs(x.mean() - (drawn.shape[1] - 1280) / 2) < 3
+            rows.append(y.max())
+        scale = 720 / 86
+        np.testing.assert_allclose(np.diff(rows), [-20 * scale, -30 * scale], atol=2)
+
+    def test_unknown_and_far_vehicles_are_left_out(self):
+        empty = Annotator(DrawParams(panel="corner"), camera=CAMERA).draw_tracks(blank(), [])
+        for known in (track(distance_m=None, distance_std_m=None), track(distance_m=90.0)):
+            drawn = Annotator(DrawParams(panel="corner"), camera=CAMERA).draw_tracks(blank(), [known])
+            np.testing.assert_array_equal(drawn[:300, 1150:], empty[:300, 1150:])
+
+    def test_a_coasting_vehicle_is_hollow(self):
+        sums = []
+        for state in ("confirmed", "coasting"):
+            ahead = track((600, 400, 680, 470), distance_std_m=0.1, speed_mps=None, state=state)
+            drawn = Annotator(SIDE, camera=CAMERA).draw_tracks(blank(), [ahead])
+            sums.append((drawn[:, 1280:] == TRACK_COLORS[0]).all(axis=2).sum())
+        assert sums[1] < 0.6 * sums[0]
+
+    def test_another_frame_size_gets_another_panel(self):
+        drawer = Annotator(DrawParams(panel="corner"))
+        drawer.draw_tracks(blank(), [track()], time=0.0)
+        small = drawer.draw_tracks(blank(360, 640), [], time=1.0)
+        assert changed_box(small, blank(360, 640))[3] == BirdsEyePanel.corner_size((360, 640))[0]
+
+
+@pytest.mark.parametrize(
+    "state",
+    [{}, {"state": "coasting", "misses": 9, "shown": False}, {"id": 0, "state": "tentative", "shown": False}],
+)
+def test_every_track_and_detection_is_blurred(state):
+    noise = np.random.default_rng(0).integers(0, 256, (120, 200, 3), dtype=np.uint8)
+    none, annotator = Detections.empty(), Annotator(blur="vehicles")
+    result = FrameResult(0, 0.0, none, none, (track([50, 30, 100, 80], **state),))
+    assert annotator.draw(noise, result)[45:70, 60:90].std() < 0.4 * noise.std()
+    detected = dataclasses.replace(result, tracks=(), detections=Detections([[50, 30, 100, 80]], [1.0]))
+    assert (annotator.draw(noise, detected) == blur_boxes(noise, [[50, 30, 100, 80]])).all()
+
+
+class TestDiagnostics:
+    @pytest.mark.parametrize(("height", "width"), [(720, 1280), (361, 481), (1920, 1080), (4, 5)])
+    def test_has_the_shape_of_the_frame(self, height, width):
+        heat = np.zeros((height, width), np.float32)
+        mosaic = draw_diagnostics(blank(height, width), np.empty((0, 4)), heat, [])
+        assert mosaic.shape == (height, width, 3)
+        assert mosaic.dtype == np.uint8
+
+    def test_shows_frame_windows_heat_and_tracks(self):
+        frame, heat = blank(), np.zeros((720, 1280))
+        heat[400:490, 600:700] = 7
+        before = frame.copy()
+        mosaic = draw_diagnostics(frame, Detections([[600, 400, 700, 490]], [1.0]), heat, [track()])
+        np.testing.assert_array_equal(frame, before)
+        panels = mosaic[:360, :640], mosaic[:360, 640:], mosaic[360:, :640], mosaic[360:, 640:]
+        inside = [panel[200:245, 300:350] for panel in panels]
+        assert (inside[0] == 90).all()
+        assert (inside[1][0, 0] != 90).any()
+        assert inside[2][20, 20].sum() > 500
+        assert panels[2][300, 500].sum() < 20
+        assert (inside[3][-1, 25] == TRACK_COLORS[0]).all()
+
+    def test_frames_need_not_be_in_c_order(self):
+        image, heat = np.random.default_rng(0).integers(0, 256, (60, 90, 3), np.uint8), np.zeros((60, 90))
+        expected = draw_diagnostics(image, [[5, 5, 30, 30]], heat, [])
+        for frame in (np.asfortranarray(image), image[:, ::-1][:, ::-1]):
+            np.testing.assert_array_equal(draw_diagnostics(frame, [[5, 5, 30, 30]], heat, []), expected)
+
+    def test_heat_may_be_smaller_empty_boolean_or_of_integers(self):
+        for heat in (np.zeros((90, 160)), np.ones((90, 160), int), np.ones((9, 16), bool), -np.ones((9, 16))):
+            assert draw_diagnostics(blank(), [], heat, []).shape == (720, 1280, 3)
+
+
+HEAT = np.zeros((720, 1280))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: DrawParams(labels=("name",)), "labels must be one of 'id', 'score'"),
+        (lambda: DrawParams(labels=3), "labels must be a list of fields, got 3; pass some of"),
+        (lambda: DrawParams(line_width=0), "line_width must be an integer from 1 to 1000; got 0"),
+        (lambda: DrawParams(color_by="speed"), "color_by must be one of 'id', 'distance'; got 'speed'"),
+        (lambda: DrawParams(panel="left"), "panel must be one of 'none', 'corner', 'side'; got 'left'"),
+        (lambda: Annotator(3), "style must be a DrawParams"),
+        (lambda: Annotator(blur="all"), "blur must be one of 'vehicles', 'plates'; got 'all'"),
+        (lambda: Annotator(own_speed=25.0), "own_speed must have a method at"),
+        (lambda: Annotator(diagnostics="yes"), "diagnostics must be True or False"),
+        (lambda: Annotator().draw(blank(), 3), "result must be a FrameResult"),
+        (lambda: draw_tracks(blank(), [[1, 2, 3, 4]]), "tracks must be Track objects.*what update returns"),
+        (lambda: draw_tracks(blank(), None), "tracks must be Track objects"),
+        (lambda: draw_diagnostics(HEAT, [], HEAT, []), r"frame must be an \(H, W, 3\)"),
+        (lambda: draw_diagnostics(blank(3, 9), [], HEAT, []), "frame must be at least 4x4 pixels"),
+        (lambda: draw_diagnostics(blank(), [], blank(), []), r"heat must be an \(h, w\) array of numbers"),
+        (lambda: draw_diagnostics(blank(), [], np.full((9, 16), np.nan), []), "heat must be finite"),
+    ],
+)
+def test_malformed_arguments_are_refused(call, message):
+    with pytest.raises(InvalidInputError, match=message):
+        call()

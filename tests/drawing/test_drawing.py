@@ -1,0 +1,403 @@
+"""Drawing into one image: boxes, labels, blurred vehicles, cells."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from tests.drawing.cases import blank, changed_box
+from vehicle_detection.boxes import Detections
+from vehicle_detection.drawing import (
+    BLACK,
+    TRACK_COLORS,
+    WHITE,
+    LabelPlacer,
+    LabelRequest,
+    blend,
+    blur_boxes,
+    draw_boxes,
+    draw_cell_shares,
+    draw_detections,
+    draw_labeled_bboxes,
+    ink_on,
+)
+from vehicle_detection.errors import InvalidInputError
+
+BLUE = [0, 0, 255]
+
+
+class TestBoxes:
+    def test_lines_lie_inside_the_half_open_box(self):
+        image = blank(50, 60, 0)
+        drawn = draw_boxes(image, [[10, 5, 40, 35]], thickness=2)
+        assert changed_box(drawn, image) == [10, 5, 40, 35]
+        assert drawn[5:7, 10:40].tolist() == [[BLUE] * 30] * 2
+        assert not drawn[7:33, 12:38].any()
+        assert int(drawn.any(axis=2).sum()) == 30 * 30 - 26 * 26
+
+    def test_draws_on_a_copy(self):
+        image = blank(50, 60, 0)
+        drawn = draw_boxes(image, [[10, 5, 40, 35]], color=(255, 0, 0))
+        assert not image.any()
+        assert drawn.shape == image.shape
+        assert drawn[5, 10].tolist() == [255, 0, 0]
+
+    def test_accepts_the_corner_pairs_of_the_course(self):
+        image = blank(50, 60, 0)
+        expected = draw_boxes(image, [[10, 5, 40, 35], [0, 0, 9, 9]], thickness=1)
+        for pairs in ([((10, 5), (40, 35)), ((0, 0), (9, 9))], [((40, 35), (10, 5)), ((9, 0), (0, 9))]):
+            np.testing.assert_array_equal(draw_boxes(image, pairs, thickness=1), expected)
+
+    @given(
+        st.lists(st.tuples(*[st.floats(-1e7, 1e7)] * 4), max_size=4),
+        st.integers(1, 200),
+        st.integers(2, 60),
+        st.integers(2, 60),
+    )
+    def test_boxes_may_lie_partly_or_wholly_outside(self, corners, thickness, height, width):
+        image = blank(height, width)
+        boxes = [[min(a, c), min(b, d), max(a, c), max(b, d)] for a, b, c, d in corners]
+        drawn = draw_boxes(image, boxes, thickness=thickness)
+        assert drawn.shape == image.shape
+        colors = {tuple(pixel) for pixel in drawn.reshape(-1, 3).tolist()}
+        assert colors <= {(90, 90, 90), (0, 0, 255)}
+
+
+class TestRegions:
+    def test_each_region_gets_its_bounding_box(self):
+        heat = np.zeros((100, 200))
+        heat[20:40, 30:80] = heat[60:90, 120:190] = 2
+        image = blank(100, 200, 0)
+        drawn = draw_labeled_bboxes(image, ndimage.label(heat))
+        np.testing.assert_array_equal(drawn, draw_boxes(image, [[30, 20, 80, 40], [120, 60, 190, 90]]))
+        assert not image.any()
+
+    def test_a_missing_label_is_skipped(self):
+        labels = np.array([[1, 0, 3, 3]] * 4)
+        image = blank(4, 4, 0)
+        expected = draw_boxes(image, [[0, 0, 1, 4], [2, 0, 4, 4]])
+        np.testing.assert_array_equal(draw_labeled_bboxes(image, (labels, 3)), expected)
+
+
+class TestDetections:
+    def test_writes_a_score_above_each_box(self):
+        image, found = blank(), Detections([[600, 400, 700, 490], [200, 400, 300, 490]], [1.25, -0.5])
+        drawn = draw_detections(image, found)
+        np.testing.assert_array_equal(
+            draw_detections(image, found, scores=False),
+            draw_boxes(image, found.boxes, color=(230, 159, 0), thickness=2),
+        )
+        left, top, right, bottom = changed_box(drawn, image)
+        assert (left, right, bottom) == (200, 700, 490)
+        assert 10 < 400 - top < 40
+        assert (image == 90).all()
+
+    def test_the_labels_of_overlapping_boxes_hide_neither_box(self):
+        image = blank()
+        found = Detections([[600, 400, 700, 490], [640, 380, 720, 470]], [1.25, 2.0])
+        bare, drawn = draw_detections(image, found, scores=False), draw_detections(image, found)
+        changed = (drawn != bare).any(axis=2)
+        assert changed.any()
+        for x1, y1, x2, y2 in found.boxes:
+            assert not changed[y1:y2, x1:x2].any()
+
+    @pytest.mark.parametrize("dtype", [np.uint8, np.int64])
+    def test_colors_may_be_arrays(self, dtype):
+        found = Detections([[600, 400, 700, 490]], [1.25])
+        expected = draw_detections(blank(), found, color=(255, 0, 0))
+        color = np.array([255, 0, 0], dtype)
+        np.testing.assert_array_equal(draw_detections(blank(), found, color=color), expected)
+
+
+class TestBlend:
+    @pytest.mark.parametrize("dtype", [np.uint8, np.float64])
+    def test_mixes_an_image_with_a_color_or_an_image(self, dtype):
+        image = np.full((4, 6, 3), 100, dtype)
+        mixed = blend(image, (200, 100, 0), 0.25)
+        assert mixed.dtype == dtype
+        assert (mixed == [125, 100, 75]).all()
+        np.testing.assert_array_equal(mixed, blend(image, np.full_like(image, (200, 100, 0)), 0.25))
+        assert (image == 100).all()
+
+
+SHAPE = (720, 1280, 3)
+FIELDS = ("#3", "24 m", "-1.2 m/s")
+
+
+def request(key, x, y, width=100, height=80, fields=FIELDS):
+    return LabelRequest(key, fields, (x, y, x + width, y + height))
+
+
+def overlap(first, second):
+    return max(min(first[2], second[2]) - max(first[0], second[0]), 0) * max(
+        min(first[3], second[3]) - max(first[1], second[1]), 0
+    )
+
+
+def test_a_label_lies_above_its_box():
+    box = request(1, 600, 400)
+    (label,) = LabelPlacer().place([box], SHAPE)
+    assert label.rectangle[0] == 600
+    assert label.rectangle[3] == 400
+    assert label.leader is None
+
+
+@pytest.mark.parametrize(("width", "lines"), [(40, 2), (100, 2), (200, 1)])
+def test_a_label_is_not_much_wider_than_its_box(width, lines):
+    (label,) = LabelPlacer().place([request(1, 600, 400, width)], SHAPE)
+    assert len(label.lines) == lines
+    assert "  ".join(label.lines) == "  ".join(FIELDS)
+    assert label.rectangle[2] - label.rectangle[0] <= max(width, 96)
+
+
+def test_the_size_does_not_depend_on_the_digits():
+    sizes = set()
+    for text in ("-1.1 m/s", "-0.8 m/s"):
+        (label,) = LabelPlacer().place([request(1, 600, 400, fields=(text,))], SHAPE)
+        sizes.add((label.rectangle[2], label.rectangle[1]))
+    assert len(sizes) == 1
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "width", "height"),
+    [(600, 0, 100, 80), (1200, 0, 80, 80), (0, 640, 100, 80), (1240, 680, 40, 40), (0, 0, 1280, 720)],
+)
+def test_labels_at_the_border_stay_in_the_image(x, y, width, height):
+    box = request(1, x, y, width, height)
+    (label,) = LabelPlacer().place([box], SHAPE)
+    assert label.rectangle[0] >= 0
+    assert label.rectangle[1] >= 0
+    assert label.rectangle[2] <= SHAPE[1]
+    assert label.rectangle[3] <= SHAPE[0]
+    if (width, height) != (1280, 720):
+        assert overlap(label.rectangle, box.box) == 0
+
+
+def test_a_row_of_vehicles_has_all_labels_outside_all_boxes():
+    row = [request(key, 500 + 45 * key, 400 + 2 * key, 70, 60) for key in range(6)]
+    labels = LabelPlacer().place(row, SHAPE)
+    for label, box in itertools.product(labels, row):
+        assert overlap(label.rectangle, box.box) == 0
+    for first, second in itertools.combinations(labels, 2):
+        assert overlap(first.rectangle, second.rectangle) == 0
+    assert any(label.leader for label in labels)
+
+
+def test_labels_of_a_crowd_hide_nothing():
+    far = [request(key, 560 + 45 * key, 300, 40, 30) for key in range(4)]
+    near = [request(key + 4, 300 + 100 * key, 330 + 5 * (key % 3), 120, 90) for key in range(6)]
+    labels = LabelPlacer().place(far + near, SHAPE)
+    for label, box in itertools.product(labels, far + near):
+        assert overlap(label.rectangle, box.box) == 0
+    for first, second in itertools.combinations(labels, 2):
+        assert overlap(first.rectangle, second.rectangle) == 0
+    assert all("  ".join(label.lines) == "  ".join(FIELDS) for label in labels)
+
+
+def test_without_room_the_last_fields_are_left_out():
+    blocked = [(0, 0, 1280, 385), (0, 490, 1280, 720)]
+    boxes = [request(key, 100 + 250 * key, 400, fields=FIELDS) for key in range(4)]
+    walls = [(box.box[2], 380, box.box[0] + 220, 500) for box in boxes]
+    placer = LabelPlacer()
+    labels = placer.place(boxes, SHAPE, blocked + walls)
+    assert labels[0].lines == ("#3  24 m", "-1.2 m/s")  # free to the left
+    assert {label.lines for label in labels[1:]} == {("#3",)}
+    for label, other in itertools.product(labels, [*(box.box for box in boxes), *blocked, *walls]):
+        assert overlap(label.rectangle, other) == 0
+    assert placer.place(boxes, SHAPE, blocked + walls) == labels
+    assert placer.place(boxes, SHAPE)[1].lines == labels[0].lines
+
+
+def test_a_leader_line_may_run_down():
+    box = request(1, 600, 100)
+    around = [(0, 0, 1280, 100), (0, 100, 600, 300), (700, 100, 1280, 300), (0, 180, 1280, 182)]
+    (label,) = LabelPlacer().place([box], SHAPE, around)
+    (_, y), (end_x, end_y) = label.leader
+    assert (y, end_y) == (box.box[3] - 1, label.rectangle[1])
+    assert label.rectangle[0] <= end_x < label.rectangle[2]
+
+
+def test_a_leader_line_runs_from_the_box_to_its_label():
+    row = [request(key, 500 + 45 * key, 400 + 2 * key, 70, 60) for key in range(6)]
+    for box, label in zip(row, LabelPlacer().place(row, SHAPE), strict=True):
+        if label.leader:
+            (x, y), (end_x, end_y) = label.leader
+            assert box.box[0] <= x < box.box[2]
+            assert y == box.box[1]
+            assert label.rectangle[0] <= end_x < label.rectangle[2]
+            assert end_y == label.rectangle[3]
+
+
+def test_a_label_keeps_its_place_until_the_better_one_has_some_space():
+    placer, blocker = LabelPlacer(), request(0, 560, 330, 250, 60, fields=())
+    first = placer.place([blocker, request(1, 600, 400)], SHAPE)[1]
+    assert first.rectangle[1] == 480  # below
+    # One pixel is enough for a new label, but not to move a label.
+    freed = request(0, 560, 300, 250, 400 - 300 - (first.rectangle[3] - first.rectangle[1]), fields=())
+    assert placer.place([freed, request(1, 600, 400)], SHAPE)[1].rectangle[1] == 480
+    assert LabelPlacer().place([freed, request(1, 600, 400)], SHAPE)[1].rectangle[3] == 400
+    away = request(0, 560, 200, 250, 60, fields=())
+    assert placer.place([away, request(1, 600, 400)], SHAPE)[1].rectangle[3] == 400
+
+
+def test_a_label_does_not_switch_to_and_fro_while_a_vehicle_passes():
+    placer, tops = LabelPlacer(), []
+    for step in range(120):
+        tremor = step % 3  # of the boxes
+        pair = [request(1, 600 + tremor, 400), request(2, 420 + 3 * step, 370 - tremor, 60, 50)]
+        label = placer.place(pair, SHAPE)[0]
+        tops.append(label.rectangle[1] - 400)
+    changes = sum(first != second for first, second in itertools.pairwise(tops))
+    assert 1 <= changes <= 2
+
+
+@pytest.mark.parametrize("color", TRACK_COLORS)
+def test_text_contrasts_with_its_label(color):
+    """Level AA of the Web Content Accessibility Guidelines 2.2: 4.5."""
+    assert contrast(ink_on(color), color) >= 4.5
+
+
+@given(st.tuples(*[st.integers(0, 255)] * 3))
+def test_text_is_black_or_white_whichever_contrasts_more(color):
+    assert contrast(ink_on(color), color) == max(contrast(ink, color) for ink in (BLACK, WHITE))
+
+
+def contrast(one, other):
+    values = np.array([one, other]) / 255
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    dark, light = sorted(linear @ [0.2126, 0.7152, 0.0722])
+    return (light + 0.05) / (dark + 0.05)
+
+
+def test_a_request_without_text_has_no_label():
+    assert LabelPlacer().place([request(1, 600, 400, fields=())], SHAPE) == [None]
+
+
+@settings(max_examples=40)
+@given(
+    st.lists(st.tuples(*[st.integers(-200, 1500)] * 2, *[st.integers(1, 400)] * 2), max_size=6),
+    st.integers(60, 800),
+    st.integers(60, 1300),
+)
+def test_all_labels_stay_in_the_image_and_are_repeatable(boxes, height, width):
+    requests = [request(key, *box, fields=("#1",)) for key, box in enumerate(boxes)]
+    placer = LabelPlacer()
+    labels = placer.place(requests, (height, width))
+    for label in labels:
+        assert 0 <= label.rectangle[0] < label.rectangle[2] <= width
+        assert 0 <= label.rectangle[1] < label.rectangle[3] <= height
+    assert LabelPlacer().place(requests, (height, width)) == labels
+    assert placer.place(requests, (height, width)) == labels
+
+
+def test_the_fields_of_a_crowd_do_not_come_and_go():
+    rng = np.random.default_rng(0)
+    corners = rng.uniform([300, 300], [900, 450], (30, 2))
+    sizes = rng.integers(40, 160, 30)
+    placer, counts = LabelPlacer(), []
+    for _ in range(50):
+        moved = corners + rng.normal(0, 0.5, corners.shape)
+        requests = [
+            request(key, round(x), round(y), int(size), int(0.8 * size))
+            for key, ((x, y), size) in enumerate(zip(moved, sizes))
+        ]
+        labels = placer.place(requests, SHAPE)
+        assert placer.place(requests, SHAPE) == labels
+        counts.append(["  ".join(label.lines).count("  ") for label in labels])
+    changes = (np.diff(counts, axis=0) != 0).mean() * 25
+    assert changes < 0.3  # for each label and second
+
+
+NOISE = np.random.default_rng(0).integers(0, 256, (120, 200, 3), dtype=np.uint8)
+
+
+def striped():
+    """An image with characters of a plate: black and white columns, 4 pixels wide."""
+    image = np.full((120, 200, 3), 90, np.uint8)
+    image[:, (np.arange(200) // 4) % 2 == 0] = 240
+    return image
+
+
+def test_the_whole_vehicle_is_blurred_and_nothing_else():
+    before = NOISE.copy()
+    blurred = blur_boxes(NOISE, [[50, 30, 100, 80]])
+    assert changed_box(blurred, NOISE) == [46, 26, 104, 84]
+    assert (before == NOISE).all()
+    assert blurred[30:80, 50:100].std() < 0.4 * NOISE.std()
+
+
+@pytest.mark.parametrize(
+    ("box", "region"), [([50, 30, 100, 80], [52, 46, 98, 84]), ([40, 30, 140, 80], [32, 46, 148, 84])]
+)
+def test_the_region_of_the_plate_is_the_lower_part(box, region):
+    blurred = blur_boxes(NOISE, [box], region="plates")
+    assert changed_box(blurred, NOISE) == region
+
+
+@pytest.mark.parametrize("region", ["vehicles", "plates"])
+def test_characters_disappear(region):
+    image = striped()
+    plate = blur_boxes(image, [[40, 20, 110, 90]], region=region)[64:80, 60:90].astype(float)
+    assert np.ptp(plate.mean(axis=(0, 2))) < 0.25 * 150
+    # No pixel keeps its value by chance of alignment: neighboring columns are nearly equal.
+    assert np.abs(np.diff(plate.mean(axis=2), axis=1)).max() < 8
+
+
+@given(
+    st.lists(st.tuples(*[st.floats(-300, 300)] * 2, *[st.floats(0, 400)] * 2), max_size=4),
+    st.sampled_from(["vehicles", "plates"]),
+)  # fmt: skip
+def test_any_box_is_accepted(corners, region):
+    boxes = [[x, y, x + width, y + height] for x, y, width, height in corners]
+    assert blur_boxes(NOISE, boxes, region=region).shape == NOISE.shape
+
+
+def test_shares_of_cells_are_drawn_by_sign_and_amount():
+    image = np.full((40, 60, 3), 90, np.uint8)
+    drawn = draw_cell_shares(image, [10, 10, 50, 30], np.array([[1.0, -1.0], [0.5, 0.0]]))
+    assert (image == 90).all()
+    orange, blue, weak, none = drawn[12, 15], drawn[12, 45], drawn[28, 15], drawn[28, 45]
+    assert orange[0] > orange[2]
+    assert blue[2] > blue[0]
+    assert 90 < weak[0] < orange[0]
+    assert (none == 90).all()
+    outside = draw_cell_shares(image, [-20, -20, 200, 100], np.zeros((3, 3)))
+    np.testing.assert_array_equal(outside, image)
+
+
+FOUND = Detections([[600, 400, 700, 490]], [1.25])
+
+
+@pytest.mark.parametrize(
+    ("draw", "message"),
+    [
+        (lambda: draw_boxes(np.zeros((5, 5, 3)), []), r"image must be an \(H, W, 3\) uint8 RGB array"),
+        (lambda: draw_boxes(blank(), [[1, 2, 3]]), r"boxes must be an \(N, 4\) number array"),
+        (lambda: draw_boxes(blank(), [], thickness=0), "thickness must be an integer from 1 to 10000"),
+        (lambda: draw_boxes(blank(), [], color="blue"), r"color must be \(red, green, blue\), 0-255 each"),
+        (lambda: draw_boxes(blank(), [], color=(0, 0, 256)), "color must be an integer from 0 to 255"),
+        (lambda: draw_labeled_bboxes(blank(), np.zeros((720, 1280), int)), "scipy.ndimage.label returns"),
+        (
+            lambda: draw_labeled_bboxes(blank(), (np.zeros((9, 9), int), 0)),
+            r"labels\[0\] must be",
+        ),
+        (lambda: draw_labeled_bboxes(blank(), (np.zeros((720, 1280)), 0)), r"labels\[0\] must be integers"),
+        (lambda: draw_detections(blank(), [[600, 400, 700, 490]]), "detections must be a Detections"),
+        (lambda: draw_detections(blank(), FOUND, line_width=0), "line_width must be an integer from 1"),
+        (lambda: blur_boxes(NOISE, [], region="faces"), "region must be one of 'vehicles', 'plates'"),
+        (lambda: blur_boxes(NOISE[..., 0], []), "image must be"),
+    ],
+)
+def test_malformed_arguments_are_refused(draw, message):
+    with pytest.raises(InvalidInputError, match=message):
+        draw()
+
+
+@pytest.mark.parametrize("none", [[], np.empty((0, 4)), Detections.empty()])
+def test_nothing_is_drawn_where_nothing_is(none):
+    np.testing.assert_array_equal(draw_boxes(blank(), none), blank())
+    np.testing.assert_array_equal(draw_detections(blank(), Detections.empty()), blank())
+    np.testing.assert_array_equal(draw_labeled_bboxes(blank(), ndimage.label(blank()[..., 0] > 90)), blank())
