@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from typer import Argument
@@ -29,55 +29,42 @@ from vehicle_detection.errors import InvalidInputError
 class BatchOptions:
     """Options of ``batch``."""
 
-    output: Annotated[
-        str,
-        option(
-            "DIR|URL",
-            "Folder or URL of the results, such as results or s3://fleet/results.",
-            "-o",
-            "--output",
-        ),
-    ]
-    sources: Annotated[
-        list[str] | None,
-        Argument(
-            metavar="SOURCES...",
-            help="Video files, folders, quoted patterns and URLs, such as CARD/ or s3://cam/*.mp4.",
-        ),
-    ] = None
-    model: shared.Model = "default"
-    classes: shared.Classes = None
-    device: shared.Device = "cpu"
-    conf: shared.Confidence = None
-    jobs: Annotated[
-        int | None, option("N", "Worker processes of one thread, such as 4; default: one per core.")
-    ] = None
-    shard: Annotated[
-        str | None, option("I/N", "Process the I-th of N parts, such as 2/8, for job arrays.")
-    ] = None
-    dask: Annotated[
-        str | None,
-        option("ADDRESS|local", "Use a Dask cluster, such as tcp://10.0.0.5:8786, or start one here."),
-    ] = None
-    group: Annotated[str, option("trip|file", "Make consecutive segments one trip, or each file.")] = "trip"
-    tracks_only: Annotated[bool, flag("--tracks-only", "Write no videos.")] = False
-    horizon: shared.Horizon = None
-    camera: shared.CameraName = None
-    fov: shared.FieldOfView = None
-    camera_height: shared.CameraHeight = None
-    every: shared.Every = None
-    blur: shared.Blur = None
-    preset: shared.Preset = "veryfast"
-    no_audio: shared.NoAudio = False
-    retry_failed: Annotated[
-        bool, flag("--retry-failed", "Process trips again whose source could not be processed.")
-    ] = False
-    dry_run: Annotated[bool, flag("--dry-run", "Only list the trips that would be processed.")] = False
-    status: Annotated[bool, flag("--status", "Only show what has been done.")] = False
-    summary: Annotated[
-        Path | None, option("FILE.csv", "Table with a row for each trip that has been done.")
-    ] = None
-    quiet: Annotated[bool, flag("-q", "Print errors only.", "--quiet")] = False
+    output: str = option(
+        ...,
+        "DIR|URL",
+        "Folder or URL of the results, such as results or s3://fleet/results.",
+        "-o",
+        "--output",
+    )
+    sources: list[str] | None = Argument(
+        None,
+        metavar="SOURCES...",
+        help="Video files, folders, quoted patterns and URLs, such as CARD/ or s3://cam/*.mp4.",
+    )
+    model: str = shared.MODEL
+    classes: str | None = shared.CLASSES
+    device: str = shared.DEVICE
+    conf: float | None = shared.CONFIDENCE
+    jobs: int | None = option(None, "N", "Worker processes of one thread, such as 4; default: one per core.")
+    shard: str | None = option(None, "I/N", "Process the I-th of N parts, such as 2/8, for job arrays.")
+    dask: str | None = option(
+        None, "ADDRESS|local", "Use a Dask cluster, such as tcp://10.0.0.5:8786, or start one here."
+    )
+    group: str = option("trip", "trip|file", "Make consecutive segments one trip, or each file.")
+    tracks_only: bool = flag("--tracks-only", "Write no videos.")
+    horizon: float | None = shared.HORIZON
+    camera: str | None = shared.CAMERA
+    fov: float | None = shared.FIELD_OF_VIEW
+    camera_height: float | None = shared.CAMERA_HEIGHT
+    every: int | None = shared.EVERY
+    blur: str | None = shared.BLUR
+    preset: str = shared.PRESET
+    no_audio: bool = shared.NO_AUDIO
+    retry_failed: bool = flag("--retry-failed", "Process trips again whose source could not be processed.")
+    dry_run: bool = flag("--dry-run", "Only list the trips that would be processed.")
+    status: bool = flag("--status", "Only show what has been done.")
+    summary: Path | None = option(None, "FILE.csv", "Table with a row for each trip that has been done.")
+    quiet: bool = flag("-q", "Print errors only.", "--quiet")
 
     def detector_options(self) -> dict[str, Any]:
         """Options of the detector that are given."""

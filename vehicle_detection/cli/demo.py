@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 from vehicle_detection.cli.options import flag, option
 from vehicle_detection.cli.output import option_names, output_folder, print_facts, print_line
@@ -35,10 +35,10 @@ _TILE = (640, 360)
 
 @option_names(random_state="--seed")
 def demo(
-    output: Annotated[Path, option("DIR", "Folder to write.", "-o", "--output")] = Path("demo"),
-    frames: Annotated[int, option("N", "Number of frames.")] = 120,
-    seed: Annotated[int, option("N", "Random seed of the scene.")] = 0,
-    report: Annotated[bool, flag("--report", "Write a page with the video and its tracks.")] = False,
+    output: Path = option(Path("demo"), "DIR", "Folder to write.", "-o", "--output"),
+    frames: int = option(120, "N", "Number of frames."),
+    seed: int = option(0, "N", "Random seed of the scene."),
+    report: bool = flag("--report", "Write a page with the video and its tracks."),
 ) -> None:
     """Draw a drive, annotate it with the default model and score it against the ground truth.
 

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from typer import Argument
@@ -39,27 +39,24 @@ _CHECKED_IMAGES = 20  # images that are searched again if no vehicle was found
 class DetectOptions:
     """Options of ``detect``."""
 
-    images: Annotated[list[Path], Argument(metavar="IMAGE...", help="Image files, such as frames/*.jpg.")]
-    output: Annotated[
-        Path | None, output_option("DIR", "Folder for annotated images, such as found.", "-o", "--output")
-    ] = None
-    boxes: Annotated[
-        Path | None, output_option("FILE", "Boxes by file name: .csv, .jsonl, .parquet or .json (COCO).")
-    ] = None
-    why: Annotated[
-        Path | None,
-        output_option(
-            "DIR", "Folder, such as why, for pictures that explain each box: the share of each cell."
-        ),
-    ] = None
-    model: shared.Model = "default"
-    classes: shared.Classes = None
-    device: shared.Device = "cpu"
-    conf: shared.Confidence = None
-    horizon: shared.Horizon = None
-    labels: Annotated[str, drawing_option("score|none", "Labels of the boxes in annotated images.")] = "score"
-    line_width: shared.LineWidth = None
-    blur: shared.Blur = None
+    images: list[Path] = Argument(..., metavar="IMAGE...", help="Image files, such as frames/*.jpg.")
+    output: Path | None = output_option(
+        None, "DIR", "Folder for annotated images, such as found.", "-o", "--output"
+    )
+    boxes: Path | None = output_option(
+        None, "FILE", "Boxes by file name: .csv, .jsonl, .parquet or .json (COCO)."
+    )
+    why: Path | None = output_option(
+        None, "DIR", "Folder, such as why, for pictures that explain each box: the share of each cell."
+    )
+    model: str = shared.MODEL
+    classes: str | None = shared.CLASSES
+    device: str = shared.DEVICE
+    conf: float | None = shared.CONFIDENCE
+    horizon: float | None = shared.HORIZON
+    labels: str = drawing_option("score", "score|none", "Labels of the boxes in annotated images.")
+    line_width: int | None = shared.LINE_WIDTH
+    blur: str | None = shared.BLUR
 
 
 @takes(DetectOptions)

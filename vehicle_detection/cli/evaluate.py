@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 from typer import Argument
 
@@ -18,35 +18,28 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    predictions: Annotated[
-        Path,
-        Argument(
-            metavar="PREDICTIONS.csv",
-            help="Boxes or tracks: .csv, .jsonl, .parquet, .txt (MOT) or .json (COCO data set or results).",
-        ),
-    ],
-    labels: Annotated[
-        Path,
-        Argument(
-            metavar="LABELS.csv", help="True boxes, in one of these formats, or a folder of KITTI or YOLO."
-        ),
-    ],
-    iou: Annotated[float, option("F", "Minimum IoU of a correct box.")] = 0.5,
-    ignored_as_regions: Annotated[
-        bool, flag("--ignored-as-regions", "Ignore boxes of which half lies in an ignored box.")
-    ] = False,
-    frames: Annotated[
-        str | None,
-        option(
-            "LIST|FILE",
-            "Score only these frames: numbers, such as 0,6,12, 0-299 or 0-299:6 (every 6th), or a text file "
-            "with the number or name of a frame in each line.",
-        ),
-    ] = None,
-    images: Annotated[
-        Path | None, option("DIR", "Folder of the images, whose sizes YOLO folders need, such as images/val.")
-    ] = None,
-    json: Annotated[Path | None, option("FILE", "File for all scores, such as scores.json.")] = None,
+    predictions: Path = Argument(
+        ...,
+        metavar="PREDICTIONS.csv",
+        help="Boxes or tracks: .csv, .jsonl, .parquet, .txt (MOT) or .json (COCO data set or results).",
+    ),
+    labels: Path = Argument(
+        ..., metavar="LABELS.csv", help="True boxes, in one of these formats, or a folder of KITTI or YOLO."
+    ),
+    iou: float = option(0.5, "F", "Minimum IoU of a correct box."),
+    ignored_as_regions: bool = flag(
+        "--ignored-as-regions", "Ignore boxes of which half lies in an ignored box."
+    ),
+    frames: str | None = option(
+        None,
+        "LIST|FILE",
+        "Score only these frames: numbers, such as 0,6,12, 0-299 or 0-299:6 (every 6th), or a text file "
+        "with the number or name of a frame in each line.",
+    ),
+    images: Path | None = option(
+        None, "DIR", "Folder of the images, whose sizes YOLO folders need, such as images/val."
+    ),
+    json: Path | None = option(None, "FILE", "File for all scores, such as scores.json."),
 ) -> None:
     """Score boxes, and tracks if there are any, against labels."""
     from json import dumps

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
 
 from vehicle_detection.cli.options import option
 from vehicle_detection.cli.output import output_folder, print_line
 
 
 def fetch(
-    output: Annotated[
-        Path | None, option("DIR", "Folder, such as data; default: the user's cache.", "-o", "--output")
-    ] = None,
+    output: Path | None = option(
+        None, "DIR", "Folder, such as data; default: the user's cache.", "-o", "--output"
+    ),
 ) -> None:
     """Download the course's training patches (110 MB) once."""
     from vehicle_detection.datasets import fetch_patches

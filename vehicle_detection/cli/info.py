@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Any
 
 from typer import Argument
 
@@ -17,9 +17,9 @@ _HIDDEN_FOLD_COLUMNS = (
 
 
 def info(
-    model: Annotated[
-        str, Argument(metavar="MODEL", help='"default", "highway" or a model file, such as own.onnx.')
-    ] = "default",
+    model: str = Argument(
+        "default", metavar="MODEL", help='"default", "highway" or a model file, such as own.onnx.'
+    ),
 ) -> None:
     """Show a model's parameters, accuracy, training data and versions."""
     from vehicle_detection.loading import load_model

@@ -6,9 +6,7 @@ import functools
 import inspect
 import re
 from collections.abc import Callable
-from dataclasses import fields
-from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 from typer import Option
 
@@ -22,14 +20,14 @@ PATCHES = "--vehicles and --non-vehicles"
 HORIZON_HELP = "Row of the horizon as a fraction of the frame's height, 0 at the top, such as 0.55."
 
 
-def option(metavar: str, help: str, *names: str, panel: str | None = None) -> Any:  # noqa: A002 - as typer
-    """Option with a value; without `names`, the parameter names it."""
-    return Option(*names, metavar=metavar, help=help, rich_help_panel=panel)
+def option(default: Any, metavar: str, help: str, *names: str, panel: str | None = None) -> Any:  # noqa: A002 - as typer
+    """Option with a value, required if `default` is `...`; without `names`, the parameter names it."""
+    return Option(default, *names, metavar=metavar, help=help, rich_help_panel=panel)
 
 
 def flag(name: str, help: str, *names: str, panel: str | None = None) -> Any:  # noqa: A002 - as typer
     """Option without a value; the help shows no type for it."""
-    return option("", help, name, *names, panel=panel)
+    return option(False, "", help, name, *names, panel=panel)
 
 
 def takes(options: type[Options]) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
@@ -43,16 +41,10 @@ def takes(options: type[Options]) -> Callable[[Callable[[Options], None]], Calla
         def run(**values: Any) -> None:
             command(options(**values))
 
-        hints = get_type_hints(options, include_extras=True)
-        required = inspect.Parameter.empty
+        hints = get_type_hints(options)
         parameters = [
-            inspect.Parameter(
-                each.name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=getattr(options, each.name, required),
-                annotation=hints[each.name],
-            )
-            for each in fields(options)  # type: ignore[arg-type]
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=getattr(options, name))
+            for name in hints
         ]
         run.__annotations__ = hints
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -68,67 +60,43 @@ search_option = functools.partial(option, panel="Search")
 drawing_option, drawing_flag = (functools.partial(each, panel="Drawing") for each in (option, flag))
 output_option, output_flag = (functools.partial(each, panel="Output") for each in (option, flag))
 
-Model = Annotated[
-    str,
-    search_option(
-        "NAME|FILE", '"default" (any road), "highway" (the course\'s), or a model file, such as yolo11n.onnx.'
-    ),
-]
-Classes = Annotated[
-    str | None,
-    search_option(
-        "LIST", "Classes of another library's network that are vehicles, such as car,bus,truck or 2,5,7."
-    ),
-]
-Device = Annotated[
-    str, search_option("cpu|cuda", "Where a network runs; cuda needs the package onnxruntime-gpu.")
-]
-Confidence = Annotated[
-    float | None,
-    search_option(
-        "P", "Minimum confidence, a probability from 0 to 1, such as 0.5; default: the model's threshold."
-    ),
-]
-Every = Annotated[
-    int | None,
-    search_option(
-        "N", "Search every N-th frame, and interpolate between; 1: every frame; default: 12 a second."
-    ),
-]
-Horizon = Annotated[float | None, camera_option("F", HORIZON_HELP)]
-CameraName = Annotated[
-    str | None,
-    camera_option(
-        "NAME|FILE", "Lens: standard-58, wide-90, fisheye-120, fisheye-140 or fisheye-170; or a JSON file."
-    ),
-]
-FieldOfView = Annotated[
-    float | None,
-    camera_option(
-        "DEG", "Field of view along the longer side in degrees, such as 90; default: 58, with a warning."
-    ),
-]
-CameraHeight = Annotated[
-    float | None,
-    camera_option("M", "Height of the lens above the road in meters, such as 1.5; default: 1.3."),
-]
-LineWidth = Annotated[
-    int | None,
-    drawing_option("N", "Width of the boxes' lines in pixels, such as 3; default: by size of the frame."),
-]
-Blur = Annotated[
-    str | None,
-    drawing_option(
-        "vehicles|plates", "Blur the vehicles, or the region of their plates, in what is written."
-    ),
-]
-Preset = Annotated[
-    str,
-    output_option("NAME", "Speed of the encoder, from ultrafast (large files) to placebo (small ones)."),
-]
-NoAudio = Annotated[bool, output_flag("--no-audio", "Write no sound.")]
-Vehicles = Annotated[Path, option("PATH", "Folder or zip of patches of vehicles, such as vehicles.zip.")]
-NonVehicles = Annotated[Path, option("PATH", "Folder or zip of other patches, such as non-vehicles.zip.")]
+MODEL = search_option(
+    "default",
+    "NAME|FILE",
+    '"default" (any road), "highway" (the course\'s), or a model file, such as yolo11n.onnx.',
+)
+CLASSES = search_option(
+    None, "LIST", "Classes of another library's network that are vehicles, such as car,bus,truck or 2,5,7."
+)
+DEVICE = search_option("cpu", "cpu|cuda", "Where a network runs; cuda needs the package onnxruntime-gpu.")
+CONFIDENCE = search_option(
+    None, "P", "Minimum confidence, a probability from 0 to 1, such as 0.5; default: the model's threshold."
+)
+EVERY = search_option(
+    None, "N", "Search every N-th frame, and interpolate between; 1: every frame; default: 12 a second."
+)
+HORIZON = camera_option(None, "F", HORIZON_HELP)
+CAMERA = camera_option(
+    None, "NAME|FILE", "Lens: standard-58, wide-90, fisheye-120, fisheye-140 or fisheye-170; or a JSON file."
+)
+FIELD_OF_VIEW = camera_option(
+    None, "DEG", "Field of view along the longer side in degrees, such as 90; default: 58, with a warning."
+)
+CAMERA_HEIGHT = camera_option(
+    None, "M", "Height of the lens above the road in meters, such as 1.5; default: 1.3."
+)
+LINE_WIDTH = drawing_option(
+    None, "N", "Width of the boxes' lines in pixels, such as 3; default: by size of the frame."
+)
+BLUR = drawing_option(
+    None, "vehicles|plates", "Blur the vehicles, or the region of their plates, in what is written."
+)
+PRESET = output_option(
+    "veryfast", "NAME", "Speed of the encoder, from ultrafast (large files) to placebo (small ones)."
+)
+NO_AUDIO = output_flag("--no-audio", "Write no sound.")
+VEHICLES = option(..., "PATH", "Folder or zip of patches of vehicles, such as vehicles.zip.")
+NON_VEHICLES = option(..., "PATH", "Folder or zip of other patches, such as non-vehicles.zip.")
 
 
 def parse_time(text: str | None, name: str) -> float | None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from vehicle_detection.cli.options import PATCHES, NonVehicles, Vehicles, flag, option
+from vehicle_detection.cli.options import NON_VEHICLES, PATCHES, VEHICLES, flag, option
 from vehicle_detection.cli.output import (
     capture_stderr,
     check_distinct_paths,
@@ -25,33 +25,24 @@ if TYPE_CHECKING:
 
 @option_names(random_state="--seed", patches_or_labels=PATCHES, patch_set=PATCHES)
 def train(
-    vehicles: Vehicles,
-    non_vehicles: NonVehicles,
-    output: Annotated[
-        Path, option("FILE", "Model file to write, such as own.safetensors.", "-o", "--output")
-    ],
-    features: Annotated[
-        str, option("PRESET", "lab-9432, lab-8460, ycrcb-8460, ycrcb-6156 or luv-2384.")
-    ] = "lab-9432",
-    split: Annotated[
-        str, option("random|sequences", "Split whose accuracy is reported as the model's.")
-    ] = "random",
-    C: Annotated[float, option("F", "Inverse regularization strength.", "--C")] = 1e-4,
-    seed: Annotated[int, option("N", "Random seed of solver and first split.")] = 0,
-    no_mirror: Annotated[bool, flag("--no-mirror", "Train without mirrored copies.")] = False,
-    gamma: Annotated[
-        float | None,
-        option("F", "Brightness range of mirrored copies, such as 0.3; default: 0.4, without mirroring 0."),
-    ] = None,
-    degraded: Annotated[
-        float, option("W", "Weight of blurred, pale and compressed copies of each patch, 0-1.")
-    ] = 0.05,
-    solver: Annotated[str, option("dual|liblinear", "liblinear is LinearSVC: same model, slower.")] = "dual",
-    report: Annotated[Path | None, option("FILE.json", "Scores on every split, timings.")] = None,
-    card: Annotated[Path | None, option("FILE.md", "Model card to write.")] = None,
-    compare: Annotated[
-        list[str] | None, option("PRESET", "Other features to evaluate, such as luv-2384; repeatable.")
-    ] = None,
+    vehicles: Path = VEHICLES,
+    non_vehicles: Path = NON_VEHICLES,
+    output: Path = option(..., "FILE", "Model file to write, such as own.safetensors.", "-o", "--output"),
+    features: str = option("lab-9432", "PRESET", "lab-9432, lab-8460, ycrcb-8460, ycrcb-6156 or luv-2384."),
+    split: str = option("random", "random|sequences", "Split whose accuracy is reported as the model's."),
+    C: float = option(1e-4, "F", "Inverse regularization strength.", "--C"),
+    seed: int = option(0, "N", "Random seed of solver and first split."),
+    no_mirror: bool = flag("--no-mirror", "Train without mirrored copies."),
+    gamma: float | None = option(
+        None, "F", "Brightness range of mirrored copies, such as 0.3; default: 0.4, without mirroring 0."
+    ),
+    degraded: float = option(0.05, "W", "Weight of blurred, pale and compressed copies of each patch, 0-1."),
+    solver: str = option("dual", "dual|liblinear", "liblinear is LinearSVC: same model, slower."),
+    report: Path | None = option(None, "FILE.json", "Scores on every split, timings."),
+    card: Path | None = option(None, "FILE.md", "Model card to write."),
+    compare: list[str] | None = option(
+        None, "PRESET", "Other features to evaluate, such as luv-2384; repeatable."
+    ),
 ) -> None:
     """Train a model on patches, and evaluate it on held-out patches; by default like the model "highway"."""
     from vehicle_detection._common import encodable, write_text

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 from typer import Argument
 
@@ -14,24 +13,20 @@ from vehicle_detection.cli.output import check_targets, name_kept_files, option_
 
 @option_names(random_state="--seed", sources="DATA", initial="--model")
 def train_frames(
-    data: Annotated[
-        Path,
-        Argument(metavar="DATA", help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4."),
-    ],
-    output: Annotated[Path, option("FILE", "Model file to write, such as own.onnx.", "-o", "--output")],
-    model: Annotated[
-        str, option("MODEL", '"default" or a file of this command to continue from, such as own.onnx.')
-    ] = "default",
-    steps: Annotated[
-        int | None,
-        option("N", "Steps of 8 samples, 0.6 s each on two cores; default: 5 per frame, 200 to 1200."),
-    ] = None,
-    device: Annotated[str | None, option("cpu|cuda", "Default: cuda where PyTorch offers it.")] = None,
-    curves: Annotated[
-        Path | None, option("FILE.csv", "Precision and recall on each set of held-out frames.")
-    ] = None,
-    jobs: Annotated[int | None, option("N", "Threads, such as 2; default: all cores.")] = None,
-    seed: Annotated[int, option("N", "Random seed.")] = 0,
+    data: Path = Argument(
+        ..., metavar="DATA", help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4."
+    ),
+    output: Path = option(..., "FILE", "Model file to write, such as own.onnx.", "-o", "--output"),
+    model: str = option(
+        "default", "MODEL", '"default" or a file of this command to continue from, such as own.onnx.'
+    ),
+    steps: int | None = option(
+        None, "N", "Steps of 8 samples, 0.6 s each on two cores; default: 5 per frame, 200 to 1200."
+    ),
+    device: str | None = option(None, "cpu|cuda", "Default: cuda where PyTorch offers it."),
+    curves: Path | None = option(None, "FILE.csv", "Precision and recall on each set of held-out frames."),
+    jobs: int | None = option(None, "N", "Threads, such as 2; default: all cores."),
+    seed: int = option(0, "N", "Random seed."),
 ) -> None:
     """Continue the training of the default model on labelled frames, and evaluate it on a fifth of them.
 

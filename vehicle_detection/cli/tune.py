@@ -6,9 +6,9 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from vehicle_detection.cli.options import PATCHES, NonVehicles, Vehicles, flag, option
+from vehicle_detection.cli.options import NON_VEHICLES, PATCHES, VEHICLES, flag, option
 from vehicle_detection.cli.output import (
     check_targets,
     option_names,
@@ -36,32 +36,26 @@ _MAX_ROWS = 15
     patch_set=PATCHES,
 )
 def tune(
-    vehicles: Vehicles,
-    non_vehicles: NonVehicles,
-    grid: Annotated[str, option("GRID", "Values to try: 'orient=8,9 color_space=YCrCb,LAB C=1e-4,1'.")],
-    output: Annotated[
-        Path,
-        option(
-            "FILE.csv",
-            "Table to write: .csv, .jsonl or .parquet. Results are saved one by one; the same command "
-            "resumes an interrupted run.",
-            "-o",
-            "--output",
-        ),
-    ],
-    plot: Annotated[Path | None, option("FILE.png", "Accuracy against search time.")] = None,
-    split: Annotated[str, option("sequences|groups|random", "Held-out patches.")] = "sequences",
-    halving: Annotated[
-        bool, flag("--halving", "Eliminate poor configurations on few patches (successive halving).")
-    ] = False,
-    finalists: Annotated[int, option("N", "Configurations to measure fully after --halving.")] = 3,
-    frames: Annotated[
-        Path | None, option("DIR", "Labelled frames to score models on, such as test_images.")
-    ] = None,
-    labels: Annotated[Path | None, option("FILE.csv", "True boxes of --frames.")] = None,
-    horizon: Annotated[float | None, option("F", "Horizon of --frames, 0 (top) to 1, such as 0.55.")] = None,
-    seed: Annotated[int, option("N", "Random seed of splits and training.")] = 0,
-    cache: Annotated[Path | None, option("DIR", "Folder to keep features in, such as cache.")] = None,
+    vehicles: Path = VEHICLES,
+    non_vehicles: Path = NON_VEHICLES,
+    grid: str = option(..., "GRID", "Values to try: 'orient=8,9 color_space=YCrCb,LAB C=1e-4,1'."),
+    output: Path = option(
+        ...,
+        "FILE.csv",
+        "Table to write: .csv, .jsonl or .parquet. Results are saved one by one; the same command "
+        "resumes an interrupted run.",
+        "-o",
+        "--output",
+    ),
+    plot: Path | None = option(None, "FILE.png", "Accuracy against search time."),
+    split: str = option("sequences", "sequences|groups|random", "Held-out patches."),
+    halving: bool = flag("--halving", "Eliminate poor configurations on few patches (successive halving)."),
+    finalists: int = option(3, "N", "Configurations to measure fully after --halving."),
+    frames: Path | None = option(None, "DIR", "Labelled frames to score models on, such as test_images."),
+    labels: Path | None = option(None, "FILE.csv", "True boxes of --frames."),
+    horizon: float | None = option(None, "F", "Horizon of --frames, 0 (top) to 1, such as 0.55."),
+    seed: int = option(0, "N", "Random seed of splits and training."),
+    cache: Path | None = option(None, "DIR", "Folder to keep features in, such as cache."),
 ) -> None:
     """Train and measure every combination of a grid of parameters, and show the best."""
     from vehicle_detection._common import check_choice, check_integer

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 from typer import Argument
 
@@ -32,115 +32,90 @@ if TYPE_CHECKING:
 class VideoOptions:
     """Options of ``video``."""
 
-    source: Annotated[
-        str,
-        Argument(
-            metavar="SOURCE",
-            help="Video file, such as drive.mp4; folder or quoted pattern of a trip's segments, or images; "
-            "URL; camera, such as 0; or -.",
-        ),
-    ]
-    output: Annotated[
-        Path | None, output_option("TARGET", "Video to write: .mp4, .m4v, .mov or .mkv.", "-o", "--output")
-    ] = None
-    show: Annotated[
-        bool, output_flag("--show", "Show the annotated frames in a window; Escape ends the run.")
-    ] = False
-    tracks: Annotated[
-        Path | None,
-        output_option("FILE", "Tracks: .csv, .jsonl, .parquet, .txt (MOT), .zip (CVAT) or .json (COCO)."),
-    ] = None
-    report: Annotated[Path | None, output_option("FILE.html", "Page with the video and its tracks.")] = None
-    why: Annotated[
-        bool, output_flag("--why", "Explain a box of each vehicle in --report: the share of each cell.")
-    ] = False
-    events: Annotated[
-        Path | None, output_option("FILE", "Events, such as cut-ins and overtaking: .csv or .json.")
-    ] = None
-    clips: Annotated[
-        Path | None, output_option("DIR", "Folder for a short annotated clip of each event, such as clips.")
-    ] = None
-    clips_of: Annotated[
-        str | None,
-        output_option("KINDS", "Kinds of events for --clips, such as cut_in,closing; default: all."),
-    ] = None
-    srt: Annotated[
-        Path | None,
-        output_option(
-            "FILE", "Subtitles with vehicles, nearest distance and events, second by second: .srt or .ass."
-        ),
-    ] = None
-    preset: shared.Preset = "veryfast"
-    no_audio: shared.NoAudio = False
-    quiet: Annotated[bool, output_flag("-q", "Print errors and warnings of damage only.", "--quiet")] = False
-    profile: Annotated[bool, output_flag("--profile", "Print the time of each stage.")] = False
-    start: Annotated[str | None, input_option("TIME", "Start time, such as 12.5 (seconds) or 12:30.")] = None
-    end: Annotated[str | None, input_option("TIME", "End time, such as 30 (seconds) or 1:02:06.")] = None
-    fps: Annotated[float, input_option("N", "Frame rate of a source of images, such as 10.")] = 25.0
-    own_speed: Annotated[
-        str | None,
-        input_option(
-            "SPEED", "Own speed in km/h, such as 100, or 62mph, for headways and speeds over ground."
-        ),
-    ] = None
-    gpx: Annotated[
-        Path | None,
-        input_option(
-            "FILE", "Own speed over time: a GPX track, or a .csv table with the columns time_s and speed_kmh."
-        ),
-    ] = None
-    gpx_offset: Annotated[
-        float,
-        input_option(
-            "S",
-            "Time of the video's start in --gpx: seconds after the first point of a track, or the "
-            "time_s of a table, such as 12.5 or -3.",
-        ),
-    ] = 0.0
-    live: Annotated[
-        bool,
-        input_flag("--live", "Drop frames of a pipe rather than lag; default for cameras and streams."),
-    ] = False
-    no_reconnect: Annotated[
-        bool, input_flag("--no-reconnect", "End with a network stream that breaks off.")
-    ] = False
-    strict: Annotated[bool, input_flag("--strict", "Fail, and write nothing, if the source is damaged.")] = (
-        False
+    source: str = Argument(
+        ...,
+        metavar="SOURCE",
+        help="Video file, such as drive.mp4; folder or quoted pattern of a trip's segments, or images; "
+        "URL; camera, such as 0; or -.",
     )
-    camera: shared.CameraName = None
-    fov: shared.FieldOfView = None
-    camera_height: shared.CameraHeight = None
-    horizon: Annotated[
-        str | None,
-        camera_option("F|auto", f'{HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.'),
-    ] = None
-    model: shared.Model = "default"
-    classes: shared.Classes = None
-    device: shared.Device = "cpu"
-    conf: shared.Confidence = None
-    every: shared.Every = None
-    jobs: Annotated[
-        int | None,
-        search_option("N", "Frames searched in parallel, such as 2; default: one per core, at most 4."),
-    ] = None
-    labels: Annotated[
-        str,
-        drawing_option(
-            "LIST", "Fields of the labels: some of id,distance,speed,score,std, such as id,distance; or none."
-        ),
-    ] = "id,distance,speed"
-    line_width: shared.LineWidth = None
-    color_by: Annotated[str, drawing_option("id|distance", "What the colors of the boxes stand for.")] = "id"
-    panel: Annotated[
-        str, drawing_option("corner|side|none", "Bird's-eye view in the frame's corner, or beside it.")
-    ] = "none"
-    units: Annotated[
-        str, drawing_option("metric|imperial", "Labels, subtitles and report in m and km/h, or ft and mph.")
-    ] = "metric"
-    blur: shared.Blur = None
-    diagnostics: Annotated[
-        bool, drawing_flag("--diagnostics", "Show frame, positive windows, heat map and tracks side by side.")
-    ] = False
+    output: Path | None = output_option(
+        None, "TARGET", "Video to write: .mp4, .m4v, .mov or .mkv.", "-o", "--output"
+    )
+    show: bool = output_flag("--show", "Show the annotated frames in a window; Escape ends the run.")
+    tracks: Path | None = output_option(
+        None, "FILE", "Tracks: .csv, .jsonl, .parquet, .txt (MOT), .zip (CVAT) or .json (COCO)."
+    )
+    report: Path | None = output_option(None, "FILE.html", "Page with the video and its tracks.")
+    why: bool = output_flag("--why", "Explain a box of each vehicle in --report: the share of each cell.")
+    events: Path | None = output_option(
+        None, "FILE", "Events, such as cut-ins and overtaking: .csv or .json."
+    )
+    clips: Path | None = output_option(
+        None, "DIR", "Folder for a short annotated clip of each event, such as clips."
+    )
+    clips_of: str | None = output_option(
+        None, "KINDS", "Kinds of events for --clips, such as cut_in,closing; default: all."
+    )
+    srt: Path | None = output_option(
+        None, "FILE", "Subtitles with vehicles, nearest distance and events, second by second: .srt or .ass."
+    )
+    preset: str = shared.PRESET
+    no_audio: bool = shared.NO_AUDIO
+    quiet: bool = output_flag("-q", "Print errors and warnings of damage only.", "--quiet")
+    profile: bool = output_flag("--profile", "Print the time of each stage.")
+    start: str | None = input_option(None, "TIME", "Start time, such as 12.5 (seconds) or 12:30.")
+    end: str | None = input_option(None, "TIME", "End time, such as 30 (seconds) or 1:02:06.")
+    fps: float = input_option(25.0, "N", "Frame rate of a source of images, such as 10.")
+    own_speed: str | None = input_option(
+        None, "SPEED", "Own speed in km/h, such as 100, or 62mph, for headways and speeds over ground."
+    )
+    gpx: Path | None = input_option(
+        None,
+        "FILE",
+        "Own speed over time: a GPX track, or a .csv table with the columns time_s and speed_kmh.",
+    )
+    gpx_offset: float = input_option(
+        0.0,
+        "S",
+        "Time of the video's start in --gpx: seconds after the first point of a track, or the "
+        "time_s of a table, such as 12.5 or -3.",
+    )
+    live: bool = input_flag(
+        "--live", "Drop frames of a pipe rather than lag; default for cameras and streams."
+    )
+    no_reconnect: bool = input_flag("--no-reconnect", "End with a network stream that breaks off.")
+    strict: bool = input_flag("--strict", "Fail, and write nothing, if the source is damaged.")
+    camera: str | None = shared.CAMERA
+    fov: float | None = shared.FIELD_OF_VIEW
+    camera_height: float | None = shared.CAMERA_HEIGHT
+    horizon: str | None = camera_option(
+        None, "F|auto", f'{HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.'
+    )
+    model: str = shared.MODEL
+    classes: str | None = shared.CLASSES
+    device: str = shared.DEVICE
+    conf: float | None = shared.CONFIDENCE
+    every: int | None = shared.EVERY
+    jobs: int | None = search_option(
+        None, "N", "Frames searched in parallel, such as 2; default: one per core, at most 4."
+    )
+    labels: str = drawing_option(
+        "id,distance,speed",
+        "LIST",
+        "Fields of the labels: some of id,distance,speed,score,std, such as id,distance; or none.",
+    )
+    line_width: int | None = shared.LINE_WIDTH
+    color_by: str = drawing_option("id", "id|distance", "What the colors of the boxes stand for.")
+    panel: str = drawing_option(
+        "none", "corner|side|none", "Bird's-eye view in the frame's corner, or beside it."
+    )
+    units: str = drawing_option(
+        "metric", "metric|imperial", "Labels, subtitles and report in m and km/h, or ft and mph."
+    )
+    blur: str | None = shared.BLUR
+    diagnostics: bool = drawing_flag(
+        "--diagnostics", "Show frame, positive windows, heat map and tracks side by side."
+    )
 
     def files(self) -> dict[str, Path | None]:
         """Files to write, by their options."""
