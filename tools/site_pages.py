@@ -39,7 +39,7 @@ README_SECTIONS = ("Start", "Your own video", "In a notebook")
 API_PAGES = (
     ("detect", "Detect and track", "detector tracking boxes camera function_model"),
     ("video", "Video and drawing", "video annotator drawing images"),
-    ("drive", "Events, reports and batches", "events report batch"),
+    ("drive", "Events, reports and batches", "drive"),
     ("tables", "Tables and files", "tables export"),
     ("models", "Models and training", "loading network svm transformer training"),
     ("explain", "Explain and explore", "explanation notebook"),

@@ -211,8 +211,8 @@ def _minute_table(counts: VehicleCounts, fps: float) -> Table:
         numbers = minute.met, minute.overtaken, minute.overtaking, minute.passed
         rows.append([name, *map(str, numbers), f"{minute.mean_in_view:.1f}", str(minute.max_in_view)])
     note = (
-        "Vehicles that were oncoming, that we overtook, that overtook us, and that we passed although they "
-        "stood or their direction is uncertain; and vehicles in view."
+        "Number of vehicles in each minute. Passed by us: vehicles that stood, or whose direction is "
+        "uncertain. The last two columns count the vehicles that are visible at the same time."
     )
     header = (
         "From", "Oncoming", "Overtaken by us", "Overtook us", "Passed by us", "Mean in view", "Most in view"
