@@ -7,6 +7,7 @@ import numpy as np
 from benchmarks._material import Context, if_real, is_real, patches
 from benchmarks._report import Row, at_least
 from vehicle_detection import (
+    TrainingOptions,
     load_classifier,
     split_leakage,
     split_random,
@@ -50,9 +51,8 @@ def accuracy_of(found: PatchSet, split: Split) -> float:
     """Accuracy on the test part of a classifier trained on the training part like the shipped model."""
     shipped = load_classifier()
     training = shipped.metadata.get("training", {})
-    options = {name: training[name] for name in ("C", "mirror", "gamma", "degraded") if name in training}
+    names = ("C", "mirror", "gamma", "degraded")
+    options = TrainingOptions(**{name: training[name] for name in names if name in training})
     train, test = found[split.train], found[split.test]
-    classifier = train_classifier(
-        train.patches, train.labels, params=shipped.params, solver="dual", **options
-    )
+    classifier = train_classifier(train.patches, train.labels, params=shipped.params, options=options)
     return classifier.score(test.patches, test.labels)

@@ -29,6 +29,7 @@ from vehicle_detection.training import (
     digest_of,
     fit_features,
     make_table,
+    to_pipeline,
 )
 
 SEEDS = range(5)
@@ -212,7 +213,7 @@ class Runs:
             from sklearn.pipeline import make_pipeline
 
             classifier = _fit_svm(FIRST, *self._side(FIRST, split.train))
-            (_, scaler), (_, svm) = classifier.to_pipeline().steps[1:]
+            (_, scaler), (_, svm) = to_pipeline(classifier).steps[1:]
             both = make_pipeline(scaler, svm)
             patches = self.patch_set.patches[split.test]
             features = extract_features(patches, FIRST)

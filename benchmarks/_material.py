@@ -150,6 +150,6 @@ def classifier_for_search(name: str = "ycrcb-8460") -> tuple[VehicleClassifier, 
         found, _ = patches()
         part = found[::_STRIDE] if is_real() else found
         params = FeatureParams.preset(name)
-        train_classifier(part.patches, part.labels, params=params, solver="dual").save(file)
+        train_classifier(part.patches, part.labels, params=params).save(file)
     source = f"every {_STRIDE}th real patch" if is_real() else "synthetic patches"
     return load_classifier(file), f"{name} model trained on {source}"

@@ -21,8 +21,6 @@ from benchmarks._timing import median_of, median_seconds, seconds_of
 from vehicle_detection import SearchParams, VehicleClassifier, load_classifier, search
 from vehicle_detection._common import available_cores
 from vehicle_detection._kernels import Filter
-from vehicle_detection._kernels import histogram as _histogram_kernels
-from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.search import SearchBand
 
 SIZES = ((640, 360), (960, 540), (1280, 720), (1600, 900), (1920, 1080))
@@ -154,8 +152,7 @@ def _timed_stages(stopwatch: _Stopwatch) -> Iterator[None]:
         def put(name: str, value: Any) -> None:
             stack.enter_context(mock.patch.object(search, name, value))
 
-        put("_hog_kernels", _TimedModule(_hog_kernels, stopwatch, _KERNELS, everything=True))
-        put("_histogram_kernels", _TimedModule(_histogram_kernels, stopwatch, _KERNELS, everything=True))
+        put("kernels", _TimedModule(search.kernels, stopwatch, _KERNELS, everything=True))
         for name, functions in _MODULES.items():
             put(name, _TimedModule(getattr(search, name), stopwatch, functions, everything=False))
         for name, stage in _FUNCTIONS.items():

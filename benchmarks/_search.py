@@ -15,6 +15,7 @@ from benchmarks._report import Row, Target, at_least, at_most
 from benchmarks._timing import median_of, seconds_of
 from vehicle_detection import Detections, SearchParams, VehicleClassifier
 from vehicle_detection.search import BandSearch
+from vehicle_detection.training import to_pipeline
 
 TOLERANCE = 1e-4
 """Tolerance of scores between the float64 reference and the float32 filters."""
@@ -41,7 +42,7 @@ def compare_searches(
     calls: int = CALLS,
 ) -> list[Row]:
     """Time both methods alternately in one process and check that they agree."""
-    scaler, svc = (step for _, step in classifier.to_pipeline().steps[-2:])
+    scaler, svc = (step for _, step in to_pipeline(classifier).steps[-2:])
     bands = params.place(frame.shape)
     course_seconds, hog_seconds = [], []
     ours: dict[int, list[float]] = {1: [], 2: []}

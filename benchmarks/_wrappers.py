@@ -11,6 +11,7 @@ from benchmarks._material import Context, patches, searched_frame
 from benchmarks._report import Row, at_most
 from benchmarks._timing import median_of, seconds_of
 from vehicle_detection import course
+from vehicle_detection.training import TrainingOptions, to_pipeline
 
 ROUNDS = 15
 _TOP, _BOTTOM, _SCALES = 400, 656, (1.5, 1.0, 0.8)
@@ -24,8 +25,8 @@ def run(context: Context) -> list[Row]:
     labels = found.labels[:: max(1, len(found) // 800)].astype(int)
     params = vd.FeatureParams(spatial_size=32, spatial_order="interleaved")
     features = np.array(course.extract_features(some, "YCrCb", hog_channel="ALL"))
-    model = vd.train_classifier(some, labels, params=params, mirror=False)
-    _, scaler, svc = (step for _, step in model.to_pipeline().steps)
+    model = vd.train_classifier(some, labels, params=params, options=TrainingOptions(mirror=False))
+    _, scaler, svc = (step for _, step in to_pipeline(model).steps)
     search = model.open_search(1)
     bands = vd.SearchParams.preset("three-scales")
     windows = vd.slide_window(frame, y_start_stop=(_TOP, _BOTTOM), xy_window=(96, 96))

@@ -25,6 +25,7 @@ from vehicle_detection import (
     render_scene,
 )
 from vehicle_detection.svm import Template
+from vehicle_detection.training import to_pipeline
 
 SEARCH = SearchParams(
     bands=(
@@ -51,7 +52,7 @@ def classifier():
 
 
 def course_search(frame, classifier):
-    scaler, svc = (step for _, step in classifier.to_pipeline().steps[-2:])
+    scaler, svc = (step for _, step in to_pipeline(classifier).steps[-2:])
     return search_course(frame, SEARCH.place(frame.shape), scaler, svc)
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.feature_cases import BLANK, PATCHES
 from vehicle_detection._kernels import bin_of_value, degree_bounds, orientation_cotangents, sqrt_gradients
-from vehicle_detection._kernels import hog as _hog_kernels
+from vehicle_detection._kernels import features as kernels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
     COLOR_SPACES,
@@ -189,7 +189,7 @@ def reference_bins(gx, gy, orient):
 
 @pytest.mark.parametrize("orient", [1, 2, 3, 4, 5, 6, 8, 9, 12, 16, 18, 36, 180])
 def test_bins_of_all_uint8_gradients_equal_the_reference(orient):
-    # The comparison of `_hog_kernels.hog_cells`, operation by operation.
+    # The comparison of `kernels.hog_cells`, operation by operation.
     _, gx, gy = all_gradients()
     some = (gx != 0) | (gy != 0)
     gx, gy = gx[some], gy[some]
@@ -217,7 +217,7 @@ def test_the_kernel_bins_all_uint8_gradients_like_the_reference(orient):
     for start in range(0, 511, 73):
         tiles = np.ascontiguousarray(image[start : start + 73].reshape(73 * 3, 511 * 3))
         cells = np.empty((1, orient, *tiles.shape), np.float32)
-        _hog_kernels.hog_cells(tiles, 1, 1, cotangents, cells)
+        kernels.hog_cells(tiles, 1, 1, cotangents, cells)
         middles = cells[0, :, 1::3, 1::3]
         rows = slice(start, start + 73)
         np.testing.assert_allclose(middles.sum(axis=0), length[rows], rtol=1e-6)

@@ -35,7 +35,7 @@ KNOWN_UPWARD = {("notebook", "scenes")}
 HEAVY = {"matplotlib", "moviepy", "sklearn", "pandas", "pooch", "jinja2", "dask", "pyarrow", "motmetrics"}
 HEAVY |= {"ipywidgets", "IPython"}
 # Modules about scikit-learn, themselves imported on first use.
-SKLEARN_MODULES = {"transformer"}
+SKLEARN_MODULES = {"training.pipeline"}
 UNSAFE = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
 
 # Public names without an example in their docstring, and why.

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.helpers import random_classifier
+from vehicle_detection.course.reference import score_windows
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import COLOR_SPACES, FeatureParams
 from vehicle_detection.search import (
@@ -20,6 +21,7 @@ from vehicle_detection.search import (
     resized_shape,
 )
 from vehicle_detection.svm import VehicleClassifier
+from vehicle_detection.training import to_pipeline
 from vehicle_detection.windows import find_cars, search_windows, slide_window
 
 PRESETS = sorted(FeatureParams.PRESETS)
@@ -44,13 +46,13 @@ IMAGE = textured(220, 330)
 
 
 def reference_map(image, band, classifier):
-    """Scores of all windows of a band at a step of one cell, by the reference search."""
+    """Scores of all windows of a band at a step of one cell, by the reference."""
     resized = resize_band(image, band)
     cell = classifier.params.pix_per_cell
     windows = slide_window(resized, xy_overlap=(1 - cell / 64,) * 2)
-    found = search_windows(resized, windows, classifier, border="image", min_score=None)
+    scores = score_windows(resized, windows, classifier)
     height, width = resized.shape[:2]
-    return found.scores.reshape(height // cell - 64 // cell + 1, width // cell - 64 // cell + 1)
+    return scores.reshape(height // cell - 64 // cell + 1, width // cell - 64 // cell + 1)
 
 
 def assert_equals_the_reference(image, band, classifier):
@@ -348,15 +350,13 @@ def test_boxes_are_in_pixels_of_the_frame():
     ]
     np.testing.assert_array_equal(found.boxes, expected)
     # Each score is that of the pixels inside its box.
-    alone = search_windows(
+    alone = score_windows(
         resize_band(frame, PixelBand(0, band.y1, 1280, band.y2, (128, 96), (1, 1))),
         [[32, 16, 96, 80]],
         classifier,
-        border="image",
-        min_score=None,
     )
     row = np.flatnonzero((found.boxes == [64, band.y1 + 24, 192, band.y1 + 120]).all(axis=1))
-    np.testing.assert_allclose(found.scores[row], alone.scores, atol=TOLERANCE)
+    np.testing.assert_allclose(found.scores[row], alone, atol=TOLERANCE)
 
 
 @given(
@@ -461,7 +461,7 @@ def test_find_cars_rejects_invalid_images(image, message):
 
 
 def test_find_cars_rejects_other_classifiers_and_parameters():
-    for other in ("model.safetensors", None, SMALL, random_classifier(SMALL).to_pipeline()):
+    for other in ("model.safetensors", None, SMALL, to_pipeline(random_classifier(SMALL))):
         with pytest.raises(InvalidInputError, match=r"classifier must be a VehicleClassifier, .* make one"):
             find_cars(IMAGE, other, small_params())
     for other in ("default", [SearchBand(window=(64, 64), y=(0, 100))], 1.5):

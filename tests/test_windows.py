@@ -6,9 +6,11 @@ from hypothesis import strategies as st
 
 from tests.helpers import random_classifier
 from vehicle_detection import course
+from vehicle_detection.course.reference import score_windows
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, extract_features, single_img_features
 from vehicle_detection.search import PixelBand, SearchParams
+from vehicle_detection.training import to_pipeline
 from vehicle_detection.windows import band_windows, search_windows, slide_window
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
@@ -156,9 +158,8 @@ def test_windows_above_the_minimum_score_are_returned():
     np.testing.assert_array_equal(default.boxes, windows[every.scores > 0])
 
 
-@pytest.mark.parametrize("border", ["window", "image"])
-def test_no_windows(border):
-    found = search_windows(IMAGE, np.empty((0, 4)), CLASSIFIER, border=border, min_score=None)
+def test_no_windows():
+    found = search_windows(IMAGE, np.empty((0, 4)), CLASSIFIER, min_score=None)
     assert found.boxes.shape == (0, 4)
 
 
@@ -183,24 +184,24 @@ def test_both_borders_differ_only_in_the_gradients():
     # The image is one window, so both borders coincide.
     window = [[0, 0, 64, 64]]
     own = search_windows(image, window, classifier, min_score=None)
-    shared = search_windows(image, window, classifier, border="image", min_score=None)
-    np.testing.assert_allclose(shared.scores, own.scores, atol=1e-5)
+    shared = score_windows(image, window, classifier)
+    np.testing.assert_allclose(shared, own.scores, atol=1e-5)
     np.testing.assert_allclose(
         own.scores, classifier.decision_function(single_img_features(image, params)[None]), atol=1e-5
     )
     wide = image_of(80, 96, 5)
     window = [[16, 8, 80, 72]]
     own = search_windows(wide, window, classifier, min_score=None)
-    shared = search_windows(wide, window, classifier, border="image", min_score=None)
-    assert np.abs(own.scores - shared.scores).max() > 1e-4
+    shared = score_windows(wide, window, classifier)
+    assert np.abs(own.scores - shared).max() > 1e-4
 
 
 def test_without_hog_both_borders_give_the_same_scores():
     classifier = random_classifier(FeatureParams(hog_feat=False))
     windows = slide_window(IMAGE, xy_overlap=(0.875, 0.875))
     own = search_windows(IMAGE, windows, classifier, min_score=None)
-    shared = search_windows(IMAGE, windows, classifier, border="image", min_score=None)
-    np.testing.assert_allclose(shared.scores, own.scores, atol=1e-9)
+    shared = score_windows(IMAGE, windows, classifier)
+    np.testing.assert_allclose(shared, own.scores, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -225,24 +226,22 @@ def test_search_windows_rejects_invalid_windows(windows, message):
 
 def test_search_windows_rejects_other_invalid_arguments():
     window = [[0, 0, 64, 64]]
-    with pytest.raises(InvalidInputError, match="border must be one of 'window', 'image'; got 'none'"):
-        search_windows(IMAGE, window, CLASSIFIER, border="none")
     with pytest.raises(InvalidInputError, match="image must be an"):
         search_windows(IMAGE / 255, window, CLASSIFIER)
     with pytest.raises(InvalidInputError, match="min_score must be a number"):
         search_windows(IMAGE, window, CLASSIFIER, min_score=np.nan)
     with pytest.raises(InvalidInputError, match=r"classifier must be a VehicleClassifier, .*from_pipeline"):
-        search_windows(IMAGE, window, CLASSIFIER.to_pipeline())
+        search_windows(IMAGE, window, to_pipeline(CLASSIFIER))
     for off_grid in ([[3, 0, 67, 64]], [[0, 0, 48, 48]]):
-        with pytest.raises(InvalidInputError, match='border="image" needs 64x64 windows at multiples of 16'):
-            search_windows(IMAGE, off_grid, CLASSIFIER, border="image")
+        with pytest.raises(InvalidInputError, match="windows must be 64x64 pixels, at multiples of 16"):
+            score_windows(IMAGE, off_grid, CLASSIFIER)
 
 
 def test_search_windows_does_not_modify_its_arguments():
     windows = slide_window(IMAGE)
     image, boxes = IMAGE.copy(), windows.copy()
     search_windows(image, boxes, CLASSIFIER)
-    search_windows(image, boxes, CLASSIFIER, border="image")
+    score_windows(image, boxes, CLASSIFIER)
     np.testing.assert_array_equal(image, IMAGE)
     np.testing.assert_array_equal(boxes, windows)
 

@@ -31,6 +31,7 @@ import numpy as np
 
 import vehicle_detection as vd
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
+from vehicle_detection.training import to_pipeline
 
 MAX_SECONDS = 60
 """Time limit of one call, which may have to compile kernels."""
@@ -216,7 +217,7 @@ class _Valid:
         (folder / "patches").mkdir()
         vd.write_image(folder / "patches" / "vehicle.png", patches[0])
         scores_of = vd.evaluate_detections(predicted, truth)
-        _, scaler, svc = (step for _, step in classifier.to_pipeline().steps)
+        _, scaler, svc = (step for _, step in to_pipeline(classifier).steps)
         moving = moviepy.VideoClip(lambda time: image, duration=0.1)
         theirs = SimpleNamespace(xyxy=boxes, confidence=scores, class_id=None)
         quick = vd.TrialOptions(time_search=False, n_jobs=1)
@@ -257,7 +258,7 @@ class _Valid:
             "pairs": np.array([[0, 1]]),
             "parameter": "orient", "methods": {"a": [windows]}, "curves": (scores, scores, scores),
             "runs": {"a": [result]}, "out": folder / "out", "target": folder / "out.mp4",
-            "pipeline": classifier.to_pipeline(), "lateral_px": 10.0, "index": 0, "imgs": [image],
+            "pipeline": to_pipeline(classifier), "lateral_px": 10.0, "index": 0, "imgs": [image],
             "split": vd.Split(np.arange(10), np.arange(10, 20)), "number": 1, "speed": own_speed,
             "speed_mps": 25.0,
         }  # fmt: skip

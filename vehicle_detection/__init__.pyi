@@ -101,6 +101,8 @@ from .tables import TrackTable
 from .tracking import FrameResult, Track, Tracker, TrackParams
 from .training import (
     FrameDataset,
+    PatchFeatures,
+    TrainingOptions,
     TrainingReport,
     TrialOptions,
     compare_classifiers,
@@ -112,7 +114,6 @@ from .training import (
     train_and_evaluate,
     train_classifier,
 )
-from .transformer import PatchFeatures
 from .video import (
     FrameSource,
     TrackRun,
@@ -176,6 +177,7 @@ __all__ = [
     "TrackTable",
     "TrackWriter",
     "Tracker",
+    "TrainingOptions",
     "TrainingReport",
     "TransientVideoError",
     "TrialOptions",

@@ -18,22 +18,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
+    Checked,
     check_bool,
     check_channel,
     check_choice,
     check_image,
     check_integer,
-    check_number,
     check_patches,
     check_type,
+    checked_field,
+    choice,
     describe,
+    flag,
+    integer,
+    number,
     progress_bar,
     resolve_jobs,
-    store_integer,
 )
 from vehicle_detection._kernels import bin_of_value, degree_bounds, orientation_cotangents, sqrt_gradients
-from vehicle_detection._kernels import histogram as _histogram_kernels
-from vehicle_detection._kernels import hog as _hog_kernels
+from vehicle_detection._kernels import features as kernels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image
 
@@ -46,11 +49,16 @@ HOG_CHANNELS: tuple[int | str, ...] = (0, 1, 2, "ALL", "GRAY")
 _LAB = {"color_space": "LAB", "spatial_size": 32}
 
 
-@dataclass(frozen=True, kw_only=True)
-class FeatureParams:
-    """Features of a 64x64 patch: ``[spatial | histogram | HOG]``, each channel by channel.
+def _check_spatial_size(size: Any, name: str) -> int:
+    """Return an integer; a pair of equal numbers is accepted too."""
+    if isinstance(size, (tuple, list)) and len(size) == 2 and size[0] == size[1]:
+        size = size[0]
+    return check_integer(size, name, low=1, high=PATCH_SIZE)
 
-    `coarse_hog` appends a second, coarser HOG: ``[spatial | histogram | HOG | coarse HOG]``.
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureParams(Checked):
+    """Features of a 64x64 patch: ``[spatial | histogram | HOG | coarse HOG]``, each channel by channel.
 
     Attributes
     ----------
@@ -81,11 +89,6 @@ class FeatureParams:
         Factors of the scaled histogram and the scaled coarse HOG in training. A larger factor weakens the
         regularization of these few features. The gains change the weights only, not the features.
 
-    Raises
-    ------
-    InvalidInputError
-        If a field is out of range, or no part is selected.
-
     Examples
     --------
     >>> FeatureParams.preset("ycrcb-6156").length
@@ -94,24 +97,24 @@ class FeatureParams:
     2352
     """
 
-    color_space: str = "YCrCb"
-    spatial_color_space: str | None = None
-    hist_color_space: str | None = None
-    spatial_feat: bool = True
-    hist_feat: bool = True
-    hog_feat: bool = True
-    spatial_size: int = 16
-    spatial_order: Literal["channels", "interleaved"] = "channels"
-    hist_bins: int = 32
-    orient: int = 9
-    pix_per_cell: int = 8
-    cell_per_block: int = 2
-    hog_channel: int | Literal["ALL", "GRAY"] = "ALL"
-    transform_sqrt: bool = False
-    hist_sqrt: bool = False
-    coarse_hog: bool = False
-    hist_gain: float = 1.0
-    coarse_gain: float = 1.0
+    color_space: str = choice("YCrCb", COLOR_SPACES)
+    spatial_color_space: str | None = choice(None, (None, *COLOR_SPACES))
+    hist_color_space: str | None = choice(None, (None, *COLOR_SPACES))
+    spatial_feat: bool = flag(True)
+    hist_feat: bool = flag(True)
+    hog_feat: bool = flag(True)
+    spatial_size: int = checked_field(16, _check_spatial_size)
+    spatial_order: Literal["channels", "interleaved"] = choice("channels", SPATIAL_ORDERS)
+    hist_bins: int = integer(32, low=1, high=256)
+    orient: int = integer(9, low=1, high=180)
+    pix_per_cell: int = integer(8, low=2, high=PATCH_SIZE)
+    cell_per_block: int = integer(2, low=1, high=PATCH_SIZE // 2)
+    hog_channel: int | Literal["ALL", "GRAY"] = choice("ALL", HOG_CHANNELS)
+    transform_sqrt: bool = flag(False)
+    hist_sqrt: bool = flag(False)
+    coarse_hog: bool = flag(False)
+    hist_gain: float = number(1.0, low=0.01, high=100)
+    coarse_gain: float = number(1.0, low=0.01, high=100)
 
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = {
         "luv-2384": {
@@ -128,33 +131,17 @@ class FeatureParams:
     }
 
     def __post_init__(self) -> None:
-        check_choice(self.color_space, "color_space", COLOR_SPACES)
-        check_choice(self.spatial_color_space, "spatial_color_space", (None, *COLOR_SPACES))
-        check_choice(self.hist_color_space, "hist_color_space", (None, *COLOR_SPACES))
-        check_choice(self.spatial_order, "spatial_order", SPATIAL_ORDERS)
-        switches = ("spatial_feat", "hist_feat", "hog_feat", "transform_sqrt", "hist_sqrt", "coarse_hog")
-        for name in switches:
-            object.__setattr__(self, name, check_bool(getattr(self, name), name))
+        super().__post_init__()
         if not (self.spatial_feat or self.hist_feat or self.hog_feat):
             raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; set one to True")
-        size: Any = self.spatial_size
-        if isinstance(size, (tuple, list)) and len(size) == 2 and size[0] == size[1]:
-            object.__setattr__(self, "spatial_size", size[0])
-        store_integer(self, "spatial_size", low=1, high=PATCH_SIZE)
-        store_integer(self, "hist_bins", low=1, high=256)
-        store_integer(self, "orient", low=1, high=180)
-        store_integer(self, "pix_per_cell", low=2, high=PATCH_SIZE)
-        store_integer(self, "cell_per_block", low=1, high=PATCH_SIZE // self.pix_per_cell)
-        check_choice(self.hog_channel, "hog_channel", HOG_CHANNELS)
-        if not isinstance(self.hog_channel, str):
-            store_integer(self, "hog_channel", low=0, high=2)
+        check_integer(self.cell_per_block, "cell_per_block", low=1, high=self.cells)
+        if not isinstance(self.hog_channel, str):  # 1.0 and True are equal to 1
+            object.__setattr__(self, "hog_channel", check_integer(self.hog_channel, "hog_channel", low=0))
         if self.coarse_hog and self.cells // 2 < self.cell_per_block:
             raise InvalidInputError(
                 f"coarse_hog must be False, because a block of {self.cell_per_block} cells of "
                 f"{2 * self.pix_per_cell} pixels does not fit into a patch; got True"
             )
-        for name in ("hist_gain", "coarse_gain"):
-            object.__setattr__(self, name, check_number(getattr(self, name), name, low=0.01, high=100))
 
     @classmethod
     def preset(cls, name: str) -> FeatureParams:
@@ -267,11 +254,6 @@ def convert_color(
     numpy.ndarray
         ``(H, W, 3)`` uint8; a copy, also for ``"RGB"``.
 
-    Raises
-    ------
-    InvalidInputError
-        If the image is not uint8 RGB or the color space is unknown.
-
     Examples
     --------
     >>> convert_color(np.full((1, 1, 3), 200, np.uint8), "YCrCb").tolist()
@@ -292,15 +274,17 @@ def convert_color(
     return out
 
 
-def hog_source(image: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.uint8]:
-    """Channels of an RGB image that HOG is computed on: ``(H, W, hog_channels)`` uint8."""
+def hog_source(
+    image: NDArray[np.uint8], params: FeatureParams, converted: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
+    """Channels of an RGB image that HOG is computed on: ``(H, W, hog_channels)`` uint8.
+
+    `converted` is the image in `params.color_space`, if it is known already.
+    """
     if params.hog_channel == "GRAY":
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)[..., None]
-    return pick_hog_channels(convert_color(image, params.color_space), params)
-
-
-def pick_hog_channels(converted: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.uint8]:
-    """Select the channels of HOG from an image that is already converted; not for ``"GRAY"``."""
+    if converted is None:
+        converted = convert_color(image, params.color_space)
     if params.hog_channel == "ALL":
         return converted
     return np.ascontiguousarray(converted[..., int(params.hog_channel), None])
@@ -364,11 +348,6 @@ def get_hog_features(
     numpy.ndarray
         1-D float64 in [0, 1], in the order block row, block column, cell row, cell column, orientation.
 
-    Raises
-    ------
-    InvalidInputError
-        If the image is not one uint8 channel, or is smaller than a block.
-
     Examples
     --------
     >>> get_hog_features(np.zeros((64, 64), np.uint8)).shape
@@ -391,11 +370,6 @@ def hog_image(
     -------
     numpy.ndarray
         ``(H, W)`` float64, for ``plt.imshow``.
-
-    Raises
-    ------
-    InvalidInputError
-        If the image is not one uint8 channel, or is smaller than a cell.
     """
     from skimage.feature import hog
 
@@ -428,11 +402,6 @@ def bin_spatial(
     numpy.ndarray
         ``(width * height * 3,)`` uint8.
 
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed.
-
     Examples
     --------
     >>> bin_spatial(np.zeros((64, 64, 3), np.uint8), 16).shape
@@ -463,11 +432,6 @@ def color_hist(img: NDArray[np.uint8], nbins: int = 32) -> NDArray[np.int64]:
     numpy.ndarray
         ``(3 * nbins,)`` int64 counts.
 
-    Raises
-    ------
-    InvalidInputError
-        If the image is malformed, or `nbins` is not in 1-256.
-
     Examples
     --------
     >>> color_hist(np.zeros((2, 2, 3), np.uint8), 2).tolist()
@@ -493,11 +457,6 @@ def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None =
     -------
     numpy.ndarray
         ``(params.length,)`` float64, ``[spatial | histogram | HOG | coarse HOG]``, each channel by channel.
-
-    Raises
-    ------
-    InvalidInputError
-        If the image is not uint8 RGB of 64x64 pixels.
 
     Examples
     --------
@@ -583,34 +542,28 @@ def _extract_batch(patches: NDArray[np.uint8], features: NDArray[np.float32], pa
     spatial, hist, hog = np.split(features, np.cumsum([params.spatial_length, params.hist_length]), axis=1)
     # Convert the colors of the whole batch as one tall image.
     tall = np.ascontiguousarray(patches).reshape(-1, PATCH_SIZE, 3)
-    converted = {
-        space: convert_color(tall, space).reshape(patches.shape) for space in params.used_color_spaces
-    }
+    converted = {space: convert_color(tall, space) for space in params.used_color_spaces}
     if params.spatial_feat:
         size = (params.spatial_size,) * 2
-        for row, patch in zip(spatial, converted[params.spatial_space]):
+        for row, patch in zip(spatial, converted[params.spatial_space].reshape(patches.shape)):
             params.spatial_planes(row)[:] = cv2.resize(patch, size).transpose(2, 0, 1)
     if params.hist_feat:
         bins = params.hist_bins
-        _histogram_kernels.patch_histograms(converted[params.hist_space], bin_of_value(bins), bins, hist)
+        colors = converted[params.hist_space].reshape(patches.shape)
+        kernels.patch_histograms(colors, bin_of_value(bins), bins, hist)
         if params.hist_sqrt:
             np.sqrt(hist, out=hist)
     if params.hog_feat:
-        channels, sizes = (
-            params.hog_channels,
-            (params.pix_per_cell, params.cell_per_block, params.coarse_blocks),
-        )
-        gray = params.hog_channel == "GRAY"
-        source = (
-            hog_source(tall, params) if gray else pick_hog_channels(converted[params.color_space], params)
-        )
+        channels = params.hog_channels
+        sizes = params.pix_per_cell, params.cell_per_block, params.coarse_blocks
+        source = hog_source(tall, params, converted.get(params.color_space))
         source = source.reshape(len(patches), PATCH_SIZE, PATCH_SIZE, channels)
         if params.transform_sqrt:
             bounds = degree_bounds(params.orient)
-            _hog_kernels.patch_hog_from_angles(*sqrt_gradients(source), bounds, channels, *sizes, hog)
+            kernels.patch_hog_from_angles(*sqrt_gradients(source), bounds, channels, *sizes, hog)
         else:
             flat = source.reshape(len(patches), PATCH_SIZE, PATCH_SIZE * channels)
-            _hog_kernels.patch_hog(flat, channels, *sizes, orientation_cotangents(params.orient), hog)
+            kernels.patch_hog(flat, channels, *sizes, orientation_cotangents(params.orient), hog)
 
 
 def read_patches(source: Any, name: str) -> NDArray[np.uint8]:

@@ -15,16 +15,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
+    Checked,
     check_array,
     check_boxes,
-    check_choice,
     check_integer,
     check_number,
     check_shape,
     check_type,
+    choice,
     describe,
-    store_integer,
-    store_number,
+    integer,
+    number,
 )
 from vehicle_detection.boxes import Detections, clip_boxes
 from vehicle_detection.errors import InvalidInputError
@@ -54,7 +55,7 @@ _SIMILAR_SIZES_FACTOR = 0.6
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeatParams:
+class HeatParams(Checked):
     """How windows become boxes by a heat map, as in the course.
 
     Attributes
@@ -71,17 +72,10 @@ class HeatParams:
         in [0, 1); 0 keeps whole regions, as in the course.
     """
 
-    weighting: Literal["score", "count"] = "score"
-    frames: int = 5
-    threshold: float | None = None
-    peak_fraction: float = 0.35
-
-    def __post_init__(self) -> None:
-        check_choice(self.weighting, "weighting", ("score", "count"))
-        store_integer(self, "frames", low=1, high=1000)
-        if self.threshold is not None:
-            store_number(self, "threshold", low=0, high=1e9)
-        store_number(self, "peak_fraction", low=0, high=0.99)
+    weighting: Literal["score", "count"] = choice("score", ("score", "count"))
+    frames: int = integer(5, low=1, high=1000)
+    threshold: float | None = number(None, low=0, high=1e9)
+    peak_fraction: float = number(0.35, low=0, high=0.99)
 
     def for_search(self, search: Any) -> HeatParams:
         """Return the same parameters with a threshold for `search`; warn if the given one cannot fit it."""

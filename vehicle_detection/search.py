@@ -21,8 +21,8 @@ import dataclasses
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, dataclass
 from typing import Any, ClassVar
 
 import cv2
@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import (
     NEW_ARRAYS,
+    Checked,
     Closing,
     ThreadTeam,
     Workspace,
@@ -38,9 +39,10 @@ from vehicle_detection._common import (
     check_image,
     check_number,
     check_type,
+    checked_field,
     describe,
+    number,
     single_threaded_opencv,
-    store_number,
 )
 from vehicle_detection._kernels import (
     Filter,
@@ -49,11 +51,10 @@ from vehicle_detection._kernels import (
     orientation_cotangents,
     sqrt_gradients,
 )
-from vehicle_detection._kernels import histogram as _histogram_kernels
-from vehicle_detection._kernels import hog as _hog_kernels
+from vehicle_detection._kernels import features as kernels
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import PATCH_SIZE, FeatureParams, convert_color, hog_source, pick_hog_channels
+from vehicle_detection.features import PATCH_SIZE, FeatureParams, convert_color, hog_source
 from vehicle_detection.images import make_thumbnail
 
 REFERENCE_WIDTH = 1280
@@ -65,6 +66,25 @@ _SIMILAR_SIDES = 1.5
 _MIN_STEP = 1 / 8
 
 Pair = tuple[float, float]
+
+
+def _pair(*, low: float, high: float) -> Callable[[Any, str], Pair]:
+    """Return a check of two numbers."""
+
+    def check(value: Any, name: str) -> Pair:
+        if not isinstance(value, tuple) or len(value) != 2:
+            raise InvalidInputError(f"{name} must be a pair of numbers, got {describe(value)}")
+        for index, each in enumerate(value):
+            check_number(each, f"{name}[{index}]", low=low, high=high)
+        return value
+
+    return check
+
+
+def _check_bands(bands: Any, name: str) -> tuple[SearchBand, ...]:
+    if not (isinstance(bands, (tuple, list)) and bands and all(isinstance(b, SearchBand) for b in bands)):
+        raise InvalidInputError(f"{name} must be a tuple of SearchBand, at least one; got {describe(bands)}")
+    return tuple(bands)
 
 
 @dataclass(frozen=True)
@@ -80,7 +100,7 @@ class PixelBand:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchBand:
+class SearchBand(Checked):
     """Windows of one size in a horizontal band, in pixels of a 1280-wide reference frame.
 
     Attributes
@@ -94,16 +114,13 @@ class SearchBand:
         Horizontal and vertical overlap of neighboring windows as fractions of their size, in [0, 1).
     """
 
-    window: Pair
-    y: Pair
-    x: Pair = (0.0, 1.0)
-    overlap: Pair = (0.875, 0.875)
+    window: tuple[float, float] = checked_field(MISSING, _pair(low=8, high=4096))
+    y: tuple[float, float] = checked_field(MISSING, _pair(low=-4096, high=4096))
+    x: tuple[float, float] = checked_field((0.0, 1.0), _pair(low=0, high=1))
+    overlap: tuple[float, float] = checked_field((0.875, 0.875), _pair(low=0, high=0.99))
 
     def __post_init__(self) -> None:
-        _check_pair(self.window, "window", low=8, high=4096)
-        _check_pair(self.y, "y", low=-4096, high=4096)
-        _check_pair(self.x, "x", low=0, high=1)
-        _check_pair(self.overlap, "overlap", low=0, high=0.99)
+        super().__post_init__()
         for name, (start, stop) in (("x", self.x), ("y", self.y)):
             if start >= stop:
                 raise InvalidInputError(
@@ -113,22 +130,10 @@ class SearchBand:
     def place(
         self, shape: tuple[int, ...], horizon: float, horizontal_padding: float = 0.0
     ) -> PixelBand | None:
-        """Place the band on a frame.
+        """Place the band on a frame of `shape` (height, width, ...); None if no window fits.
 
-        Parameters
-        ----------
-        shape
-            ``(height, width, ...)`` of the frame.
-        horizon
-            Row of the horizon as a fraction of the frame's height, 0 at the top.
-        horizontal_padding
-            Fraction of a window's width by which a band that ends at the frame's left or right border extends
-            beyond it.
-
-        Returns
-        -------
-        PixelBand or None
-            The band in pixels; None if no window fits, or windows are smaller than 16 pixels.
+        A band that ends at the frame's left or right border extends beyond it by `horizontal_padding` of a
+        window's width.
         """
         height, width = shape[:2]
         scale = max(height, width) / REFERENCE_WIDTH
@@ -149,7 +154,7 @@ class SearchBand:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchParams:
+class SearchParams(Checked):
     """Positions and sizes of the windows that are searched.
 
     Attributes
@@ -172,21 +177,10 @@ class SearchParams:
     horizon_tolerance: ClassVar[float] = 0.1
     """Maximum error of the horizon that the bands allow, as a fraction of the frame's height."""
 
-    bands: tuple[SearchBand, ...]
-    horizon: float = 0.58
-    min_score: float = 0.0
-    horizontal_padding: float = 0.0
-
-    def __post_init__(self) -> None:
-        bands: object = self.bands
-        if not (isinstance(bands, (tuple, list)) and bands and all(isinstance(b, SearchBand) for b in bands)):
-            raise InvalidInputError(
-                f"bands must be a tuple of SearchBand, at least one; got {describe(bands)}"
-            )
-        object.__setattr__(self, "bands", tuple(bands))
-        store_number(self, "horizon", low=0, high=1)
-        store_number(self, "min_score", low=-1e6, high=1e6)
-        store_number(self, "horizontal_padding", low=0, high=0.9)
+    bands: tuple[SearchBand, ...] = checked_field(MISSING, _check_bands)
+    horizon: float = number(0.58, low=0, high=1)
+    min_score: float = number(0.0, low=-1e6, high=1e6)
+    horizontal_padding: float = number(0.0, low=0, high=0.9)
 
     @classmethod
     def default(cls) -> SearchParams:
@@ -234,13 +228,6 @@ class SearchParams:
                 f"{self.horizon:g} of its height; pass a larger image, or change horizon or bands"
             )
         return fitting
-
-
-def _check_pair(value: object, name: str, *, low: float, high: float) -> None:
-    if not isinstance(value, tuple) or len(value) != 2:
-        raise InvalidInputError(f"{name} must be a pair of numbers, got {describe(value)}")
-    for index, number in enumerate(value):
-        check_number(number, f"{name}[{index}]", low=low, high=high)
 
 
 def _window_list() -> SearchParams:
@@ -329,10 +316,7 @@ class FrameSearch(Closing, ABC):
         min_vehicle_score
             Minimum score of a vehicle. It has no effect if vehicles are derived from the windows.
 
-        Raises
-        ------
-        InvalidInputError
-            If an argument is malformed, or a search with `SearchParams` has no window in the frame.
+        An error says what is malformed, or that a search with `SearchParams` has no window in the frame.
         """
         start = time.perf_counter()
         check_image(frame, "frame")
@@ -529,12 +513,12 @@ class BandFilters:
         for template, (filters, bias) in enumerate(zip(self.filters, self.biases)):
             scores[template] = bias
             if tables is not None:
-                _histogram_kernels.histogram_cells(hist, tables[template], cell, maps[-1][-1])
+                kernels.histogram_cells(hist, tables[template], cell, maps[-1][-1])
             for template_filter, channels in zip(filters, maps):
                 template_filter.add_to(channels, scores[template], workspace)
         if self.hist_roots:
             weights = self.weights_by_bin
-            _histogram_kernels.add_root_histograms(hist, self.bins, weights, cell, self.cells, scores)
+            kernels.add_root_histograms(hist, self.bins, weights, cell, self.cells, scores)
         return scores[0] if len(scores) == 1 else np.asarray(scores.max(axis=0))
 
     def _hog_maps(
@@ -544,25 +528,22 @@ class BandFilters:
         params, channels = self.params, self.params.hog_channels
         cell = params.pix_per_cell
         rows, columns = band.shape[0] // cell, band.shape[1] // cell
-        gray = params.hog_channel == "GRAY"
-        source = (
-            hog_source(band, params) if gray else pick_hog_channels(converted[params.color_space], params)
-        )
+        source = hog_source(band, params, converted.get(params.color_space))
         cells = workspace.take((channels, params.orient, rows, columns), np.float32, "cells")
         if params.transform_sqrt:
-            _hog_kernels.sum_orientations(*sqrt_gradients(source), self.bounds, channels, cell, cells)
+            kernels.sum_orientations(*sqrt_gradients(source), self.bounds, channels, cell, cells)
         else:
             flat = np.ascontiguousarray(source).reshape(source.shape[0], -1)
-            _hog_kernels.hog_cells(flat, channels, cell, self.cotangents, cells)
+            kernels.hog_cells(flat, channels, cell, self.cotangents, cells)
         shape = (channels, self.block, self.block, params.orient, rows, columns)
         blocks = workspace.take(shape, np.float32, "blocks")
-        _hog_kernels.normalize_blocks(cells, self.block, 1, blocks)
+        kernels.normalize_blocks(cells, self.block, 1, blocks)
         maps = [blocks.reshape(-1, rows, columns)]
         if self.coarse:
             pooled = workspace.take(cells.shape, np.float32, "pooled")
-            _hog_kernels.pool_cells(cells, pooled)
+            kernels.pool_cells(cells, pooled)
             blocks = workspace.take(shape, np.float32, "coarse blocks")
-            _hog_kernels.normalize_blocks(pooled, self.block, 2, blocks)
+            kernels.normalize_blocks(pooled, self.block, 2, blocks)
             maps.append(blocks.reshape(-1, rows, columns))
         return maps
 
@@ -577,7 +558,7 @@ class BandFilters:
             memory = workspace.take((size[1], size[0], 3), image.dtype, "bins")
             bins = cv2.resize(image[: rows * cell, : columns * cell], size, dst=memory)
             cells = channels[:count].reshape(3, per_cell, per_cell, rows, columns)
-            _histogram_kernels.spatial_cells(bins, per_cell, cells)
+            kernels.spatial_cells(bins, per_cell, cells)
         return channels
 
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,10 +28,6 @@ from vehicle_detection.boxes import Platt
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.features import PATCH_SIZE, FeatureParams, extract_features
 from vehicle_detection.search import BandFilters, BandSearch, SearchParams
-
-if TYPE_CHECKING:
-    from sklearn.pipeline import Pipeline
-
 
 KIND = "patches"
 """Value of ``kind`` in the model files of patch classifiers."""
@@ -277,34 +273,6 @@ class VehicleClassifier:
         if len(steps) > 1:
             check_uint8(template, params)
         return cls(params, (template,), metadata or {})
-
-    def to_pipeline(self) -> Pipeline:
-        """Convert to a fitted scikit-learn pipeline: `PatchFeatures`, ``StandardScaler``, ``LinearSVC``.
-
-        Raises
-        ------
-        InvalidInputError
-            If the model has several templates.
-        """
-        from sklearn.pipeline import Pipeline
-        from sklearn.preprocessing import StandardScaler
-        from sklearn.svm import LinearSVC
-
-        from vehicle_detection.transformer import PatchFeatures
-
-        if len(self.templates) > 1:
-            raise InvalidInputError(
-                f"only a model with one template converts; this has {len(self.templates)}"
-            )
-        template = self.templates[0]
-        scaler, svm = StandardScaler(), LinearSVC()
-        scaler.mean_, scaler.scale_ = template.mean.copy(), template.scale.copy()
-        scaler.var_, scaler.n_samples_seen_ = template.scale**2, 1
-        svm.coef_, svm.intercept_ = template.coef[None].copy(), np.array([template.intercept])
-        svm.classes_ = np.array([0, 1])
-        scaler.n_features_in_ = svm.n_features_in_ = self.params.length
-        features = PatchFeatures(**asdict(self.params))
-        return Pipeline([("features", features), ("scaler", scaler), ("svm", svm)])
 
     @cached_property
     def filters(self) -> BandFilters:

@@ -1,10 +1,9 @@
-"""The reference search: one window after another, simple and slow."""
+"""Windows: listed by `slide_window`, and classified by `search_windows` and `find_cars`."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import (
     check_array,
     check_boxes,
-    check_choice,
     check_image,
     check_integer,
     check_number,
@@ -24,13 +22,7 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
     PATCH_SIZE,
-    FeatureParams,
-    bin_spatial,
-    color_hist,
-    convert_color,
     extract_features,
-    hog_blocks,
-    hog_source,
 )
 from vehicle_detection.search import PixelBand, SearchParams
 from vehicle_detection.svm import CLASSIFIER_REMEDY, VehicleClassifier
@@ -168,7 +160,6 @@ def search_windows(
     windows: Detections | ArrayLike,
     classifier: VehicleClassifier,
     *,
-    border: Literal["window", "image"] = "window",
     min_score: float | None = 0.0,
     n_jobs: int | None = None,
 ) -> Detections:
@@ -182,10 +173,6 @@ def search_windows(
         ``(N, 4)`` whole-pixel boxes inside the image, from `slide_window` or elsewhere.
     classifier
         Scores the windows, cropped and resized to 64x64.
-    border
-        Where HOG gradients are zero: ``"window"``, at the window's border, as on a training patch;
-        ``"image"``, at the image's border only, as in a search that shares HOG between windows. The latter is
-        the reference for `find_cars` and needs windows of 64x64 pixels on the cell grid.
     min_score
         Minimum score of the returned windows (exclusive); None returns all.
     n_jobs
@@ -199,11 +186,10 @@ def search_windows(
     Raises
     ------
     InvalidInputError
-        If a window exceeds the image, is empty, or is not on the grid that `border` requires.
+        If a window exceeds the image or is empty.
     """
     check_image(image)
     check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
-    check_choice(border, "border", ("window", "image"))
     given = check_boxes(windows, "windows")
     boxes = given.astype(np.int64)
     fractional = (boxes != given).any(1)
@@ -223,77 +209,13 @@ def search_windows(
             f"windows must be non-empty boxes inside the {width}x{height} image; got {boxes[row].tolist()} "
             f"in row {row}; use slide_window, or clip_boxes and drop empty boxes"
         )
-    if border == "window":
-        patches = np.empty((len(boxes), PATCH_SIZE, PATCH_SIZE, 3), np.uint8)
-        for patch, (x1, y1, x2, y2) in zip(patches, boxes):
-            cv2.resize(image[y1:y2, x1:x2], (PATCH_SIZE, PATCH_SIZE), dst=patch)
-        features: NDArray[Any] = extract_features(patches, classifier.params, n_jobs=n_jobs)
-    else:
-        features = _shared_hog_features(image, boxes, classifier)
+    patches = np.empty((len(boxes), PATCH_SIZE, PATCH_SIZE, 3), np.uint8)
+    for patch, (x1, y1, x2, y2) in zip(patches, boxes):
+        cv2.resize(image[y1:y2, x1:x2], (PATCH_SIZE, PATCH_SIZE), dst=patch)
+    features = extract_features(patches, classifier.params, n_jobs=n_jobs)
     scores = classifier.decision_function(features)
     found = Detections(boxes, scores)
     return found if min_score is None else found[scores > min_score]
-
-
-def _shared_hog_features(
-    image: NDArray[np.uint8], boxes: NDArray[np.int64], classifier: VehicleClassifier
-) -> NDArray[np.float64]:
-    """Features of 64x64 windows on the cell grid, with one scikit-image HOG of the whole image."""
-    params = classifier.params
-    cell, blocks = params.pix_per_cell, params.blocks
-    sizes = boxes[:, 2:] - boxes[:, :2]
-    if (sizes != PATCH_SIZE).any() or (boxes[:, :2] % cell).any():
-        raise InvalidInputError(
-            f'border="image" needs {PATCH_SIZE}x{PATCH_SIZE} windows at multiples of {cell} pixels; '
-            "resize the image so that the window is 64x64"
-        )
-    spatial_image = convert_color(image, params.spatial_space)
-    hist_image = convert_color(image, params.hist_space)
-    hog: list[NDArray[Any]] = []
-    coarse: list[NDArray[Any]] = []
-    if params.hog_feat:
-        source = hog_source(image, params)
-        planes = [source[..., channel] for channel in range(params.hog_channels)]
-        hog = [_hog_blocks(plane, cell, params) for plane in planes]
-        coarse = [_coarse_blocks(plane, params) for plane in planes] if params.coarse_hog else []
-    span = 2 * params.coarse_blocks
-    features = np.empty((len(boxes), params.length))
-    for row, (x1, y1, x2, y2) in enumerate(boxes):
-        parts: list[NDArray[Any]] = []
-        if params.spatial_feat:
-            patch = np.ascontiguousarray(spatial_image[y1:y2, x1:x2])
-            parts.append(bin_spatial(patch, params.spatial_size, order=params.spatial_order))
-        if params.hist_feat:
-            counts = color_hist(np.ascontiguousarray(hist_image[y1:y2, x1:x2]), params.hist_bins)
-            parts.append(np.sqrt(counts) if params.hist_sqrt else counts)
-        top, left = y1 // cell, x1 // cell
-        parts += [part[top : top + blocks, left : left + blocks].ravel() for part in hog]
-        parts += [part[top : top + span : 2, left : left + span : 2].ravel() for part in coarse]
-        features[row] = np.concatenate(parts)
-    return features
-
-
-def _hog_blocks(channel: NDArray[np.uint8], cell: int, params: FeatureParams) -> NDArray[np.float64]:
-    """HOG of one channel with cells of `cell` pixels; see `hog_blocks`."""
-    return hog_blocks(
-        channel, params.orient, cell, params.cell_per_block, transform_sqrt=params.transform_sqrt
-    )
-
-
-def _coarse_blocks(channel: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.float64]:
-    """HOG of double-sized cells at every cell: ``[y, x]`` is the block that starts at cell ``[y, x]``.
-
-    For odd cells the image is shifted by one cell. The new border is a reflection: the gradient between an
-    image and its reflection is zero, as at the image's border.
-    """
-    cell, block = params.pix_per_cell, params.cell_per_block
-    rows, columns = (side // cell for side in channel.shape)
-    found = np.zeros((rows, columns, block, block, params.orient))
-    for odd_y, odd_x in itertools.product((0, 1), repeat=2):
-        shifted = cv2.copyMakeBorder(channel, odd_y * cell, 0, odd_x * cell, 0, cv2.BORDER_REFLECT_101)
-        blocks = _hog_blocks(np.asarray(shifted, np.uint8), 2 * cell, params)[odd_y:, odd_x:]
-        found[odd_y::2, odd_x::2][: len(blocks), : blocks.shape[1]] = blocks
-    return found
 
 
 def find_cars(
@@ -305,7 +227,8 @@ def find_cars(
 ) -> Detections:
     """Find the windows of a frame that look like vehicles.
 
-    Scores equal those of `search_windows` with ``border="image"`` on each resized band within 1e-4.
+    A band is resized once, and its windows share their features. Gradients are zero at the band's border, and
+    not at a window's as in `search_windows`; `vehicle_detection.course.reference` gives the same scores.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import vehicle_detection
-from vehicle_detection._kernels.histogram import value_counts
+from vehicle_detection._kernels.features import value_counts
 from vehicle_detection._kernels.jit import _Compilation, _save
 
 
@@ -59,7 +59,7 @@ def test_a_change_of_another_kernel_file_is_noticed(tmp_path):
     copy = tmp_path / "vehicle_detection"
     shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__", "*.safetensors"))
     code = (
-        "import numpy as np; from vehicle_detection._kernels.histogram import value_counts;"
+        "import numpy as np; from vehicle_detection._kernels.features import value_counts;"
         "value_counts(np.zeros((4, 4, 3), np.uint8), np.zeros((3, 256), int));"
         "print(sum(value_counts.stats.cache_hits.values()))"
     )

@@ -10,7 +10,7 @@ from vehicle_detection.evaluation import FrameBoxes, read_labels
 from vehicle_detection.features import FeatureParams
 from vehicle_detection.images import write_image
 from vehicle_detection.search import SearchBand, SearchParams
-from vehicle_detection.training import mine_negatives, train_classifier
+from vehicle_detection.training import TrainingOptions, mine_negatives, train_classifier
 from vehicle_detection.windows import find_cars
 
 
@@ -91,10 +91,10 @@ def test_options_limit_the_number_of_windows(frames, labels, random_svm):
 def test_training_with_mined_patches_removes_false_positives(patch_set, frames, labels):
     params = FeatureParams(**SMALL)
     few = patch_set[::3]
-    before = train_classifier(few.patches, few.labels, params=params, C=0.1)
+    before = train_classifier(few.patches, few.labels, params=params, options=TrainingOptions(C=0.1))
     mined = mine_negatives(frames.frames, labels, before, search_params=SEARCH, min_score=-0.5)
     more = PatchSet.concatenate([few, mined])
-    after = train_classifier(more.patches, more.labels, params=params, C=0.1)
+    after = train_classifier(more.patches, more.labels, params=params, options=TrainingOptions(C=0.1))
     counts = [(each.decision_function(mined.patches) > -0.5).sum() for each in (before, after)]
     assert counts[1] < counts[0] / 2
     assert after.score(few.patches, few.labels) > 0.9

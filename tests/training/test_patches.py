@@ -48,7 +48,7 @@ def patch_set():
 
 @pytest.fixture(scope="module")
 def trained(patch_set):
-    return train_and_evaluate(patch_set, params=SMALL, random_state=3, seeds=2)
+    return train_and_evaluate(patch_set, params=SMALL, options=TrainingOptions(random_state=3), seeds=2)
 
 
 def test_every_split_is_evaluated(trained, patch_set):
@@ -73,7 +73,7 @@ def test_every_split_is_evaluated(trained, patch_set):
 @pytest.mark.parametrize(("mirror", "gamma"), [(True, 0.0), (False, 0.0), (True, 0.4)])
 def test_the_scores_equal_training_on_the_training_part_only(patch_set, mirror, gamma):
     _, report = train_and_evaluate(
-        patch_set, params=SMALL, random_state=3, seeds=2, mirror=mirror, gamma=gamma
+        patch_set, params=SMALL, options=TrainingOptions(random_state=3, mirror=mirror, gamma=gamma), seeds=2
     )
     splits = {
         "random": [split_random(patch_set, random_state=seed) for seed in (3, 4)],
@@ -88,10 +88,7 @@ def test_the_scores_equal_training_on_the_training_part_only(patch_set, mirror, 
                 patch_set.patches[train],
                 patch_set.labels[train],
                 params=SMALL,
-                mirror=mirror,
-                gamma=gamma,
-                random_state=3,
-                solver="dual",
+                options=TrainingOptions(mirror=mirror, gamma=gamma, random_state=3),
             )
             assert alone.score(patch_set.patches[test], patch_set.labels[test]) == accuracy
         assert score.leakage == split_leakage(patch_set, each[0])
@@ -105,7 +102,9 @@ def test_error_rates():
 
 def test_the_model_is_trained_on_all_patches(trained, patch_set):
     classifier, report = trained
-    plain = train_classifier(patch_set.patches, patch_set.labels, params=SMALL, random_state=3, solver="dual")
+    plain = train_classifier(
+        patch_set.patches, patch_set.labels, params=SMALL, options=TrainingOptions(random_state=3)
+    )
     for name in ("mean", "scale", "coef", "intercept"):
         np.testing.assert_array_equal(
             getattr(classifier.templates[0], name), getattr(plain.templates[0], name)
@@ -127,7 +126,12 @@ def test_training_again_writes_the_same_file(patch_set, tmp_path, split):
     before = patch_set.patches.copy()
     for name, jobs in (("a", 1), ("b", 3)):
         classifier, report = train_and_evaluate(
-            patch_set, params=SMALL, split=split, seeds=1, n_jobs=jobs, random_state=5
+            patch_set,
+            params=SMALL,
+            split=split,
+            seeds=1,
+            n_jobs=jobs,
+            options=TrainingOptions(random_state=5),
         )
         classifier.save(tmp_path / name)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
@@ -225,7 +229,7 @@ def test_the_card_holds_data_license_accuracy_and_limitations(trained):
 
 def test_the_card_of_own_patches_does_not_mention_the_course():
     own = named(*render_patches(24), {True: ("mine", "mine"), False: ("other", "other")})
-    classifier, report = train_and_evaluate(own, params=SMALL, seeds=1, mirror=False)
+    classifier, report = train_and_evaluate(own, params=SMALL, seeds=1, options=TrainingOptions(mirror=False))
     text = model_card(classifier, report)
     for word in ("GTI", "KITTI", "Extras", "CC BY", "```", "Other features"):
         assert word not in text
@@ -240,11 +244,13 @@ def test_the_card_of_own_patches_does_not_mention_the_course():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"C": 0}, "C must be a number, greater than 0"),
+        ({"options": {"C": 1}}, "options must be a TrainingOptions"),
         ({"split": "half"}, "split must be one of 'random', 'sequences'; got 'half'"),
         ({"seeds": 0}, "seeds must be an integer from 1 to 1000; got 0"),
-        ({"random_state": -1}, "random_state must be an integer from 0"),
-        ({"random_state": 2**32 - 1}, "random_state must be an integer from 0 to 4294967291"),
+        (
+            {"options": TrainingOptions(random_state=2**32 - 1)},
+            "random_state must be an integer from 0 to 4294967291",
+        ),
         ({"n_jobs": 0}, "n_jobs must be an integer from 1"),
     ],
 )

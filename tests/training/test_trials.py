@@ -31,7 +31,10 @@ def test_a_trial_equals_training_on_that_part(patch_set, mirror, split):
     (row,) = table.to_dict("records")
     train, test = patch_set[parts.train], patch_set[parts.test]
     classifier = train_classifier(
-        train.patches, train.labels, params=PARAMS, C=0.01, mirror=mirror, random_state=3, solver="dual"
+        train.patches,
+        train.labels,
+        params=PARAMS,
+        options=TrainingOptions(C=0.01, mirror=mirror, random_state=3),
     )
     config = TrialConfig(PARAMS, TrainingOptions(C=0.01, mirror=mirror))
     tried = TrialEvaluator(patch_set, UNTIMED).train(config, parts.train, 3)
@@ -76,7 +79,7 @@ def test_frames_are_scored_like_the_detector(patch_set, frames, labels):
     options = TrialOptions(frames=[frames, other], search_params=SEARCH)
     (row,) = compare_configurations(patch_set, [SMALL], C=0.1, options=options).to_dict("records")
     train = patch_set[split_sequences(patch_set).train]
-    classifier = train_classifier(train.patches, train.labels, params=PARAMS, C=0.1)
+    classifier = train_classifier(train.patches, train.labels, params=PARAMS, options=TrainingOptions(C=0.1))
     scores = []
     for each in (frames, other):
         with VehicleDetector(classifier, search_params=SEARCH, horizon=each.horizon) as detector:

@@ -2,7 +2,7 @@
 
 import vehicle_detection._common  # noqa: F401 - checks the environment variables of numba first
 from vehicle_detection._kernels.correlation import Filter
-from vehicle_detection._kernels.hog import (
+from vehicle_detection._kernels.features import (
     bin_of_value,
     degree_bounds,
     orientation_cotangents,

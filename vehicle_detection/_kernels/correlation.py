@@ -14,7 +14,7 @@ from vehicle_detection._kernels.jit import compiles, jit
 from vehicle_detection._kernels.vector import block_adder, float_block
 
 _BLOCK = float_block()
-_LANES = _BLOCK.lanes
+_LANES, _COLUMNS = _BLOCK.lanes, _BLOCK.columns
 _add_products = block_adder(_BLOCK)
 # For at most one vector of each row.
 _add_few = block_adder(_BLOCK._replace(vectors=1))
@@ -59,10 +59,10 @@ class Filter:
         ``(window rows, window columns)`` with at most as many windows as fit.
         """
         (height, width), margin = scores.shape, self._margin
-        stride = width + _BLOCK.columns
+        stride = width + _COLUMNS
         sums = workspace.take(((height + 2 * margin) * stride,), np.float32, "window sums")
         blocks = self._list_blocks(height, width, stride)
-        _kernel()(with_spare(channels), self._weights, blocks, sums, stride, self._dilation, _BLOCK.columns)
+        _kernel()(with_spare(channels), self._weights, blocks, sums, stride, self._dilation, _COLUMNS)
         scores += sums.reshape(-1, stride)[margin : margin + height, :width]
 
     def _list_blocks(self, height: int, width: int, stride: int) -> Blocks:

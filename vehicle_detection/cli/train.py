@@ -37,7 +37,6 @@ def train(
         None, "F", "Brightness range of mirrored copies, such as 0.3; default: 0.4, without mirroring 0."
     ),
     degraded: float = option(0.05, "W", "Weight of blurred, pale and compressed copies of each patch, 0-1."),
-    solver: str = option("dual", "dual|liblinear", "liblinear is LinearSVC: same model, slower."),
     report: Path | None = option(None, "FILE.json", "Scores on every split, timings."),
     card: Path | None = option(None, "FILE.md", "Model card to write."),
     compare: list[str] | None = option(
@@ -48,7 +47,7 @@ def train(
     from vehicle_detection._common import encodable, write_text
     from vehicle_detection.datasets import load_training_patches
     from vehicle_detection.features import FeatureParams
-    from vehicle_detection.training import model_card, train_and_evaluate
+    from vehicle_detection.training import TrainingOptions, model_card, train_and_evaluate
 
     check_distinct_paths({"--non-vehicles": non_vehicles}, {"--vehicles": vehicles})
     sources = {"--vehicles": vehicles, "--non-vehicles": non_vehicles}
@@ -59,14 +58,16 @@ def train(
         presets += [FeatureParams.preset(name) for name in compare or ()]
     if gamma is None:
         gamma = 0.0 if no_mirror else 0.4
-    options: dict[str, Any] = {"C": C, "mirror": not no_mirror, "gamma": gamma, "degraded": degraded}
-    options |= {"solver": solver, "random_state": seed, "split": split}
+    options = TrainingOptions(C=C, mirror=not no_mirror, gamma=gamma, degraded=degraded, random_state=seed)
 
     with capture_stderr():
         patches = load_training_patches(vehicles, non_vehicles)
 
     def train_all() -> list[Any]:
-        return [train_and_evaluate(patches, params=params, progress=True, **options) for params in presets]
+        return [
+            train_and_evaluate(patches, params=params, options=options, split=split, progress=True)
+            for params in presets
+        ]
 
     (classifier, evaluated), *rest = run_interruptible(train_all)
     others = [other for _, other in rest]
@@ -81,7 +82,6 @@ def train(
             words = ["--vehicles", vehicles.name, "--non-vehicles", non_vehicles.name, "--features", features]
             words += ["--split", split, "--C", f"{C:g}", "--seed", str(seed)] + ["--no-mirror"] * no_mirror
             words += ["--gamma", f"{gamma:g}", "--degraded", f"{degraded:g}"]
-            words += ["--solver", solver] if solver != "dual" else []
             words += [word for name in compare or () for word in ("--compare", name)]
             words += ["-o", output.name, "--card", card.name]
             command = shlex.join(["vehicle-detection", "train", *words])

@@ -24,12 +24,23 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from vehicle_detection.course.defaults import set_lesson_defaults
 from vehicle_detection.course.detector import HeatmapDetector
-from vehicle_detection.course.features import bin_spatial, color_hist, convert_color, get_hog_features
-from vehicle_detection.course.heat import add_heat, apply_threshold, draw_boxes, draw_labeled_bboxes
+from vehicle_detection.course.features import (
+    bin_spatial,
+    color_hist,
+    convert_color,
+    get_hog_features,
+    set_lesson_defaults,
+)
+from vehicle_detection.course.search import find_car_windows, find_cars, search_windows
 from vehicle_detection.course.vectors import extract_features, single_img_features
-from vehicle_detection.course.windows import find_car_windows, find_cars, search_windows, slide_window
+from vehicle_detection.course.windows import (
+    add_heat,
+    apply_threshold,
+    draw_boxes,
+    draw_labeled_bboxes,
+    slide_window,
+)
 
 if TYPE_CHECKING:
     from matplotlib import image as mpimg

@@ -16,9 +16,9 @@ from vehicle_detection._common import (
     check_type,
     describe,
 )
-from vehicle_detection.course.defaults import or_default
-from vehicle_detection.course.heat import draw_boxes
-from vehicle_detection.course.windows import find_car_windows
+from vehicle_detection.course.features import or_default
+from vehicle_detection.course.search import find_car_windows
+from vehicle_detection.course.windows import draw_boxes
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE

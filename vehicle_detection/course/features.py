@@ -1,7 +1,8 @@
-"""Features of one image: color conversion, HOG, spatial bins and color histograms."""
+"""Features of one image: color conversion, HOG, spatial bins and color histograms; their defaults."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -10,25 +11,121 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
+    check_array,
     check_choice,
     check_flags,
     check_integer,
+    check_number,
     check_type,
     describe,
 )
 from vehicle_detection._kernels import degree_bounds, orientation_cotangents, sqrt_gradients
-from vehicle_detection._kernels import histogram as _histogram_kernels
-from vehicle_detection._kernels import hog as _hog_kernels
-from vehicle_detection.course.checks import Image, check_lesson_image, check_range, check_size
-from vehicle_detection.course.defaults import or_default
+from vehicle_detection._kernels import features as kernels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import COLOR_SPACES, SPATIAL_ORDERS
 
+Image = NDArray[Any]
 Size = int | Sequence[int]
 SpatialOrder = Literal["interleaved", "channels"]
 
+Formula = Literal["old", "new"]
+FORMULAS = ("old", "new")
 # OpenCV's names of the color spaces by their name in upper case.
 _OPENCV_SPACES = {space.upper(): space for space in (*COLOR_SPACES, "BGR", "GRAY")}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Defaults:
+    transform_sqrt: bool = False
+    formula: Formula = "old"
+
+
+_defaults = _Defaults()
+
+
+def set_lesson_defaults(*, transform_sqrt: bool | None = None, formula: Formula | None = None) -> None:
+    """Set the defaults in which published versions of ``lesson_functions.py`` differ.
+
+    They hold for all later calls in this process that do not pass the option. A `HeatmapDetector` keeps those
+    of its construction. None leaves a default as it is.
+
+    Parameters
+    ----------
+    transform_sqrt
+        Default of all functions that compute HOG, initially False. True if your own file calls
+        scikit-image's ``hog`` with ``transform_sqrt=True``, as most published ones do.
+    formula
+        Default of `slide_window`, initially ``"old"``. ``"new"`` if your own ``slide_window`` computes
+        ``nx_buffer``. `find_cars` keeps its own default.
+
+    Raises
+    ------
+    InvalidInputError
+        If a value is invalid; no default changes then.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from vehicle_detection.course import slide_window
+    >>> image = np.zeros((64, 128, 3), np.uint8)
+    >>> set_lesson_defaults(formula="new")
+    >>> len(slide_window(image, xy_overlap=(0.5, 0)))
+    3
+    >>> set_lesson_defaults(formula="old")
+    """
+    global _defaults
+    given: dict[str, Any] = {}
+    if transform_sqrt is not None:
+        check_flags(transform_sqrt=transform_sqrt)
+        given["transform_sqrt"] = bool(transform_sqrt)
+    if formula is not None:
+        check_choice(formula, "formula", FORMULAS)
+        given["formula"] = formula
+    _defaults = dataclasses.replace(_defaults, **given)
+
+
+def or_default(value: Any, name: str) -> Any:
+    """Return an option's value, or its default if it is None."""
+    return getattr(_defaults, name) if value is None else value
+
+
+def check_lesson_image(img: Any, name: str = "img", *, drop_alpha: bool = False) -> Image:
+    """Return an ``(H, W, 3)`` image as uint8 or float32; `drop_alpha` accepts a fourth channel."""
+    has_alpha = isinstance(img, np.ndarray) and img.ndim == 3 and img.shape[2] == 4
+    if has_alpha and drop_alpha:
+        img = np.ascontiguousarray(img[..., :3])
+    elif has_alpha:
+        raise InvalidInputError(
+            f"{name} must be an (H, W, 3) RGB array, got {describe(img)}; drop the alpha channel with "
+            f"{name}[..., :3]"
+        )
+    if not isinstance(img, np.ndarray) or img.ndim != 3 or img.shape[2] != 3 or not img.size:
+        raise InvalidInputError(f"{name} must be an (H, W, 3) RGB array; got {describe(img)}")
+    if img.dtype in (np.uint8, np.float32):
+        return img
+    if img.dtype.kind != "f":
+        raise InvalidInputError(
+            f"{name} must be uint8 or float, got {img.dtype}; convert it with {name}.astype(numpy.uint8)"
+        )
+    return img.astype(np.float32)
+
+
+def check_size(size: Any, name: str) -> tuple[int, int]:
+    """Return ``(width, height)`` of a pair or of one number."""
+    pair = (size, size) if check_array(size, name).ndim == 0 else tuple(size)
+    if len(pair) != 2:
+        raise InvalidInputError(f"{name} must be (width, height); got {describe(size)}")
+    return check_integer(pair[0], name, low=1), check_integer(pair[1], name, low=1)
+
+
+def check_range(limits: Any, name: str) -> tuple[float, float] | None:
+    """Return the range of a histogram; None stands for the range of the values."""
+    if limits is None:
+        return None
+    if check_array(limits, name).shape != (2,):
+        raise InvalidInputError(f"{name} must be (low, high) or None; got {describe(limits)}")
+    low = check_number(limits[0], name)
+    return low, check_number(limits[1], name, above=low)
 
 
 def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
@@ -132,6 +229,8 @@ def get_hog_features(
     check_flags(vis=vis, visualise=visualise, visualize=visualize, feature_vec=feature_vec)
     transform_sqrt = or_default(transform_sqrt, "transform_sqrt")
     check_flags(transform_sqrt=transform_sqrt)
+    sizes = {"orient": orient, "pix_per_cell": pix_per_cell, "cell_per_block": cell_per_block}
+    orient, pix_per_cell, cell_per_block = (check_integer(size, name, low=1) for name, size in sizes.items())
     channel = img if img.dtype in (np.uint8, np.float32) else img.astype(np.float64)
     blocks = hog_blocks(channel[..., None], orient, pix_per_cell, cell_per_block, bool(transform_sqrt))[0]
     blocks = np.ascontiguousarray(blocks, np.float32 if channel.dtype == np.float32 else np.float64)
@@ -248,9 +347,7 @@ def hog_maps(
 
     The last ``cell_per_block - 1`` rows and columns hold no whole block.
     """
-    check_integer(orient, "orient", low=1)
-    cell = check_integer(pix_per_cell, "pix_per_cell", low=1)
-    block = check_integer(cell_per_block, "cell_per_block", low=1)
+    cell, block = pix_per_cell, cell_per_block
     height, width, channels = image.shape
     side = cell * block
     if min(height, width) < side:
@@ -260,12 +357,12 @@ def hog_maps(
     cells = np.empty((channels, orient, height // cell, width // cell), np.float32)
     if transform_sqrt:
         gradients = sqrt_gradients(image) if image.dtype == np.uint8 else _sqrt_gradients(image)
-        _hog_kernels.sum_orientations(*gradients, degree_bounds(orient), channels, cell, cells)
+        kernels.sum_orientations(*gradients, degree_bounds(orient), channels, cell, cells)
     else:
         flat = np.ascontiguousarray(image).reshape(height, -1)
-        _hog_kernels.hog_cells(flat, channels, cell, orientation_cotangents(orient), cells)
+        kernels.hog_cells(flat, channels, cell, orientation_cotangents(orient), cells)
     blocks = np.empty((channels, block, block, *cells.shape[1:]), np.float32)
-    _hog_kernels.normalize_blocks(cells, block, 1, blocks)
+    kernels.normalize_blocks(cells, block, 1, blocks)
     return blocks
 
 
@@ -289,7 +386,7 @@ def bin_indices(image: Image, bins: int, limits: tuple[float, float]) -> NDArray
     values = np.arange(256).reshape(1, -1, 1) if image.dtype == np.uint8 else image
     edges = np.histogram_bin_edges(values, bins, limits).astype(np.float64)
     indices = np.empty(values.shape, np.intp)
-    _histogram_kernels.find_bins(values, edges, indices)
+    kernels.find_bins(values, edges, indices)
     return indices.ravel()[image] if image.dtype == np.uint8 else indices
 
 

@@ -6,32 +6,37 @@ import dataclasses
 import functools
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Literal, ParamSpec, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import features as library
 from vehicle_detection._common import (
-    check_choice,
+    Checked,
     check_flags,
-    check_integer,
+    checked_field,
+    choice,
     describe,
+    integer,
     is_listing,
 )
-from vehicle_detection.course.checks import Image, check_lesson_image, check_range, check_size
-from vehicle_detection.course.defaults import or_default
 from vehicle_detection.course.features import (
+    Image,
     Size,
     SpatialOrder,
     bin_spatial,
+    check_lesson_image,
+    check_range,
+    check_size,
     color_hist,
     convert_color,
     get_hog_features,
     hog_blocks,
-    hog_maps,
+    or_default,
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import COLOR_SPACES, PATCH_SIZE, SPATIAL_ORDERS, FeatureParams
@@ -49,6 +54,15 @@ _UNUSED: dict[str, dict[str, Any]] = {
     "hist_feat": {"hist_bins": 32, "hist_range": (0, 256)},
     "hog_feat": {"orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "hog_channel": 0},
 }
+# The options of earlier calls.
+_checked: dict[str, FeatureOptions] = {}
+_MAX_CHECKED = 64
+
+
+def _check_switch(value: Any, name: str) -> bool:
+    """Return a switch as a bool; the lesson's code also passes 0 and 1."""
+    check_flags(**{name: value})
+    return bool(value)
 
 
 def accept_cspace(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
@@ -118,11 +132,6 @@ def single_img_features(
     -------
     numpy.ndarray, or a pair
         1-D float64, ``[spatial | histogram | HOG]``; with `vis` also the picture, ``(H, W)`` float64.
-
-    Raises
-    ------
-    InvalidInputError
-        If `vis` is set without HOG, or with that of all channels, and where `extract_features` raises.
 
     Examples
     --------
@@ -243,54 +252,54 @@ def _read_like_lesson(path: str) -> Image:
     return np.divide(image, 255, dtype=np.float32)
 
 
-@dataclass(frozen=True)
-class FeatureOptions:
+@dataclass(frozen=True, kw_only=True)
+class FeatureOptions(Checked):
     """The feature options of a lesson function, checked."""
 
-    color_space: str
-    spatial_size: Any  # (width, height)
-    hist_bins: int
-    orient: int
-    pix_per_cell: int
-    cell_per_block: int
-    hog_channel: int | str
-    spatial_feat: bool
-    hist_feat: bool
-    hog_feat: bool
-    hist_range: tuple[float, float] | None
-    transform_sqrt: bool  # None: the default of `set_lesson_defaults`
-    spatial_order: SpatialOrder
+    color_space: str = choice(MISSING, COLOR_SPACES)
+    spatial_size: tuple[int, int] = checked_field(MISSING, check_size)  # (width, height)
+    hist_bins: int = integer(low=1)
+    orient: int = integer(low=1)
+    pix_per_cell: int = integer(low=1)
+    cell_per_block: int = integer(low=1)
+    hog_channel: int | str = choice(MISSING, (0, 1, 2, "ALL"))
+    spatial_feat: bool = checked_field(MISSING, _check_switch)
+    hist_feat: bool = checked_field(MISSING, _check_switch)
+    hog_feat: bool = checked_field(MISSING, _check_switch)
+    hist_range: tuple[float, float] | None = checked_field(MISSING, check_range)
+    transform_sqrt: bool = checked_field(MISSING, _check_switch)
+    spatial_order: Literal["interleaved", "channels"] = choice(MISSING, SPATIAL_ORDERS)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "transform_sqrt", or_default(self.transform_sqrt, "transform_sqrt"))
-        for name in ("spatial_feat", "hist_feat", "hog_feat", "transform_sqrt"):
-            check_flags(**{name: getattr(self, name)})
-            object.__setattr__(self, name, bool(getattr(self, name)))
-        if not (self.spatial_feat or self.hist_feat or self.hog_feat):
-            raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; switch one on")
         for switch, unused in _UNUSED.items():  # the lesson's code does not read them
-            if not getattr(self, switch):
+            if not _check_switch(getattr(self, switch), switch):
                 for name, value in unused.items():
                     object.__setattr__(self, name, value)
-        check_choice(self.color_space, "color_space", COLOR_SPACES)
-        check_choice(self.hog_channel, "hog_channel", (0, 1, 2, "ALL"))
-        check_choice(self.spatial_order, "spatial_order", SPATIAL_ORDERS)
-        object.__setattr__(self, "spatial_size", check_size(self.spatial_size, "spatial_size"))
-        object.__setattr__(self, "hist_range", check_range(self.hist_range, "hist_range"))
-        for name in ("hist_bins", "orient", "pix_per_cell", "cell_per_block"):
-            object.__setattr__(self, name, check_integer(getattr(self, name), name, low=1))
+        super().__post_init__()
+        if not (self.spatial_feat or self.hist_feat or self.hog_feat):
+            raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; switch one on")
 
     @classmethod
-    def of(cls, arguments: dict[str, Any]) -> FeatureOptions:
-        """Pick the options from all arguments of a lesson function, by name."""
-        return cls(**{field.name: arguments[field.name] for field in dataclasses.fields(cls)})
+    def of(cls, arguments: dict[str, Any]) -> Self:
+        """Pick the options from all arguments of a lesson function, by name.
 
-    @property
+        Programs call a function for each frame and window with the same options, which are checked once.
+        """
+        options = {field.name: arguments[field.name] for field in dataclasses.fields(cls)}
+        options["transform_sqrt"] = or_default(options["transform_sqrt"], "transform_sqrt")
+        key = f"{cls.__name__}({options})"
+        if key not in _checked:
+            if len(_checked) == _MAX_CHECKED:
+                _checked.clear()
+            _checked[key] = cls(**options)
+        return _checked[key]  # type: ignore[return-value]
+
+    @cached_property
     def blocks(self) -> int:
         """HOG block positions along a side of a 64x64 window."""
         return PATCH_SIZE // self.pix_per_cell - self.cell_per_block + 1
 
-    @property
+    @cached_property
     def length(self) -> int:
         """Length of the feature vector of a 64x64 window."""
         width, height = self.spatial_size
@@ -302,26 +311,27 @@ class FeatureOptions:
         )
         return sum(lengths)
 
-    @property
+    @cached_property
     def has_library_range(self) -> bool:
         """Whether the histogram covers the range of the library's."""
         return not self.hist_feat or self.hist_range == (0, 256)
 
-    def library_params(self, color_space: str) -> FeatureParams | None:
+    @cached_property
+    def params(self) -> FeatureParams | None:
         """Parameters of the library for the same vector, but for `hist_range`; None if there are none."""
         width, height = self.spatial_size
         if self.spatial_feat and width != height:
             return None
-        options = vars(self) | {"color_space": color_space, "spatial_size": width}
-        del options["hist_range"]
+        names = [field.name for field in dataclasses.fields(FeatureOptions) if field.name != "hist_range"]
+        options = {name: getattr(self, name) for name in names}
         try:
-            return FeatureParams(**options)
+            return FeatureParams(**options | {"spatial_size": width})
         except InvalidInputError:
             return None
 
     def compute(self, images: Images) -> list[NDArray[Any]]:
         """Feature vectors of images in the lesson's order: float32 from the kernels, else float64."""
-        params = self.library_params(self.color_space) if self.has_library_range else None
+        params = self.params if self.has_library_range else None
         if params is None or not are_uint8_patches(images):
             return [self._compute_one(image) for image in images]
         patches = images if isinstance(images, np.ndarray) else np.stack(images)
@@ -332,7 +342,7 @@ class FeatureOptions:
         converted = convert_color(image, self.color_space)
         parts: list[NDArray[Any]] = self.color_parts(converted)
         if self.hog_feat:
-            parts.append(self.hog_blocks(converted).ravel())
+            parts.append(hog_blocks(*self.hog_arguments(converted)).ravel())
         return np.concatenate(parts).astype(np.float64)
 
     def color_parts(self, converted: Image) -> list[NDArray[Any]]:
@@ -344,15 +354,8 @@ class FeatureOptions:
             parts.append(color_hist(converted, self.hist_bins, self.hist_range))
         return parts
 
-    def hog_blocks(self, converted: Image) -> NDArray[np.float32]:
-        """HOG of the selected channels of a converted image; see `hog_blocks`."""
-        return hog_blocks(*self._hog_arguments(converted))
-
-    def hog_maps(self, converted: Image) -> NDArray[np.float32]:
-        """HOG of the selected channels of a converted image; see `hog_maps`."""
-        return hog_maps(*self._hog_arguments(converted))
-
-    def _hog_arguments(self, converted: Image) -> tuple[Any, ...]:
+    def hog_arguments(self, converted: Image) -> tuple[Any, ...]:
+        """Arguments of `hog_blocks` and `hog_maps` for the selected channels of a converted image."""
         channels = slice(None) if self.hog_channel == "ALL" else [int(self.hog_channel)]
         sizes = (self.orient, self.pix_per_cell, self.cell_per_block)
         return converted[..., channels], *sizes, self.transform_sqrt

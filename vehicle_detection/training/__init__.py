@@ -1,6 +1,6 @@
 """Training of patch classifiers and of networks, their validation, and parameter search.
 
-What needs PyTorch is imported when it is first used.
+What needs PyTorch or scikit-learn is imported when it is first used.
 """
 
 import importlib
@@ -81,6 +81,7 @@ if TYPE_CHECKING:
         save_weights,
         train_network,
     )
+    from vehicle_detection.training.pipeline import PatchFeatures, to_pipeline
     from vehicle_detection.training.weights import read_weights
 
 _MODULES = {
@@ -89,6 +90,7 @@ _MODULES = {
         "FineTuning", "detect_logits", "file_params", "fine_tune_network", "fingerprint", "load_content",
         "package_versions", "score_logits",
     ),
+    "pipeline": ("PatchFeatures", "to_pipeline"),
     "network": ("NetworkTraining", "load_weights", "save_weights", "train_network"),
     "weights": ("read_weights",),
 }  # fmt: skip
@@ -96,7 +98,7 @@ _PACKAGES = ("torch", "onnx", "google")
 
 
 def __getattr__(name: str) -> Any:
-    """Import what needs PyTorch and onnx."""
+    """Import what needs PyTorch, onnx or scikit-learn, when it is used."""
     for module, names in _MODULES.items():
         if name in names:
             try:
@@ -121,6 +123,7 @@ __all__ = [
     "FoldScore",
     "FrameDataset",
     "NetworkTraining",
+    "PatchFeatures",
     "RowStore",
     "SearchableModel",
     "SplitScore",
@@ -171,6 +174,7 @@ __all__ = [
     "select_frames",
     "set_metadata",
     "split_table",
+    "to_pipeline",
     "train_and_evaluate",
     "train_classifier",
     "train_network",

@@ -29,7 +29,6 @@ from vehicle_detection.evaluation import calibrate_scores, calibration_error
 from vehicle_detection.features import FeatureParams
 from vehicle_detection.svm import VehicleClassifier
 from vehicle_detection.training.classifier import (
-    DEFAULT_C,
     TrainingOptions,
     check_labels,
     fit_features,
@@ -130,12 +129,7 @@ def train_and_evaluate(
     patch_set: PatchSet,
     *,
     params: FeatureParams | None = None,
-    C: float = DEFAULT_C,
-    mirror: bool = True,
-    gamma: float = 0.0,
-    degraded: float = 0.0,
-    solver: Literal["liblinear", "dual"] = "dual",
-    random_state: int = 0,
+    options: TrainingOptions | None = None,
     split: Literal["random", "sequences"] = "random",
     seeds: int = 5,
     n_jobs: int | None = None,
@@ -150,13 +144,8 @@ def train_and_evaluate(
     ----------
     patch_set
         Patches of both classes.
-    params, C, mirror, gamma, degraded
-        As in `train_classifier`.
-    solver
-        As in `train_classifier`; ``"dual"`` is the default because the models of all splits are trained at
-        the same time, without copies of the features.
-    random_state
-        Seed of the solver and of the first random split.
+    params, options
+        As in `train_classifier`; the seed is also that of the first random split.
     split
         Split whose accuracy is reported as the model's. Others are skipped if the patches do not allow them.
     seeds
@@ -192,12 +181,11 @@ def train_and_evaluate(
     labels = check_labels(patch_set.labels, len(patch_set))
     params = FeatureParams() if params is None else params
     check_type(params, "params", FeatureParams, "omit it for the default")
-    options = TrainingOptions(
-        C=C, solver=solver, mirror=mirror, gamma=gamma, degraded=degraded, random_state=random_state
-    )
+    options = TrainingOptions() if options is None else options
+    check_type(options, "options", TrainingOptions, "omit it for the default")
     check_choice(split, "split", ("random", "sequences"))
     check_integer(seeds, "seeds", low=1, high=1000)
-    check_integer(random_state, "random_state", low=0, high=2**32 - seeds)
+    random_state = check_integer(options.random_state, "random_state", low=0, high=2**32 - seeds)
     splits, skipped = _make_splits(patch_set, split, range(random_state, random_state + seeds))
     inner = _inner_split(patch_set, splits["sequences"][0]) if "sequences" in splits else None
     seconds: dict[str, float] = {}

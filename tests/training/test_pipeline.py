@@ -13,7 +13,7 @@ from tests.feature_cases import PATCHES
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, extract_features
 from vehicle_detection.scenes import render_patches
-from vehicle_detection.transformer import PatchFeatures
+from vehicle_detection.training import PatchFeatures
 
 
 def test_the_transformer_equals_extract_features():

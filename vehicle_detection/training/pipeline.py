@@ -1,15 +1,20 @@
-"""`PatchFeatures`: the features as a scikit-learn transformer."""
+"""Pipelines of scikit-learn: `PatchFeatures`, and a model as a pipeline."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.pipeline import Pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.svm import LinearSVC
 
+from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, extract_features
+from vehicle_detection.svm import VehicleClassifier
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -57,23 +62,7 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         return FeatureParams(**arguments)
 
     def fit(self, X: Any, y: Any = None) -> PatchFeatures:
-        """Check the parameters.
-
-        Parameters
-        ----------
-        X, y
-            Patches and labels, which are ignored.
-
-        Returns
-        -------
-        PatchFeatures
-            This transformer.
-
-        Raises
-        ------
-        InvalidInputError
-            If a parameter is invalid.
-        """
+        """Check the parameters; `X` and `y`, patches and labels, are ignored."""
         self.to_params()
         return self
 
@@ -95,3 +84,27 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         tags.requires_fit = False
         tags.transformer_tags.preserves_dtype = []
         return tags
+
+
+def to_pipeline(classifier: VehicleClassifier) -> Pipeline:
+    """Convert a model with one template to a fitted pipeline: `PatchFeatures`, `StandardScaler`, `LinearSVC`.
+
+    Examples
+    --------
+    >>> from vehicle_detection import load_classifier
+    >>> list(to_pipeline(load_classifier()).named_steps)
+    ['features', 'scaler', 'svm']
+    """
+    if len(classifier.templates) > 1:
+        raise InvalidInputError(
+            f"only a model with one template converts; this has {len(classifier.templates)}"
+        )
+    template = classifier.templates[0]
+    scaler, svm = StandardScaler(), LinearSVC()
+    scaler.mean_, scaler.scale_ = template.mean.copy(), template.scale.copy()
+    scaler.var_, scaler.n_samples_seen_ = template.scale**2, 1
+    svm.coef_, svm.intercept_ = template.coef[None].copy(), np.array([template.intercept])
+    svm.classes_ = np.array([0, 1])
+    scaler.n_features_in_ = svm.n_features_in_ = classifier.params.length
+    features = PatchFeatures(**asdict(classifier.params))
+    return Pipeline([("features", features), ("scaler", scaler), ("svm", svm)])

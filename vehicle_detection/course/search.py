@@ -1,0 +1,594 @@
+"""The classification of windows: one by one, and the search that shares one HOG between all windows.
+
+A linear classifier of scikit-learn, behind a scaler or not, becomes the library's: the filters of its fast
+search give the scores of all windows. Others predict a feature vector for each window.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import sys
+import warnings
+from dataclasses import MISSING, dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._common import Workspace, choice, describe, integer, number
+from vehicle_detection.course.features import (
+    FORMULAS,
+    Formula,
+    Image,
+    Size,
+    SpatialOrder,
+    bin_indices,
+    bin_spatial,
+    check_lesson_image,
+    color_hist,
+    convert_color,
+    count_bins,
+    hog_blocks,
+    hog_maps,
+)
+from vehicle_detection.course.vectors import FeatureOptions, accept_cspace, are_uint8_patches
+from vehicle_detection.course.windows import Box, box_rows, corner_array, draw_corners
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import PATCH_SIZE
+from vehicle_detection.search import BandFilters
+from vehicle_detection.svm import (
+    UNIT_CHANNELS,
+    VehicleClassifier,
+    fold_estimators,
+    has_unit_range,
+    n_features,
+)
+
+ResizeOrder = Literal["after conversion", "before conversion"]
+
+# Number of windows whose features are in memory at a time.
+_CHUNK = 512
+# Greatest value of a channel of a 0-1 image, with a margin: V of YUV reaches 1.12.
+_MAX_UNIT = 1.2
+# Least share of the values outside of the first bins that shows histograms of another range than 0-1.
+_MIN_SPREAD = 0.1
+# The attributes that a linear classifier and a scaler compute with.
+_MODEL_STATE = (
+    "classes_", "n_features_in_",
+    "coef_", "intercept_", "mean_", "center_", "min_", "scale_", "with_mean", "with_std", "clip",
+)  # fmt: skip
+
+
+@accept_cspace
+def search_windows(
+    img: Image,
+    windows: Any,
+    clf: Any,
+    scaler: Any,
+    color_space: str = "RGB",
+    spatial_size: Size = (32, 32),
+    hist_bins: int = 32,
+    hist_range: tuple[float, float] | None = (0, 256),
+    orient: int = 9,
+    pix_per_cell: int = 8,
+    cell_per_block: int = 2,
+    hog_channel: int | str = 0,
+    spatial_feat: bool = True,
+    hist_feat: bool = True,
+    hog_feat: bool = True,
+    *,
+    transform_sqrt: bool | None = None,
+    spatial_order: SpatialOrder = "interleaved",
+) -> list[Any]:
+    """Classify each window of an image, resized to 64x64 pixels.
+
+    Parameters
+    ----------
+    img
+        ``(H, W, 3)`` RGB with the range of values that the classifier was trained on: float 0-1 after
+        training on PNG files (``image.astype(np.float32) / 255``), uint8 otherwise.
+    windows
+        Corner pairs from `slide_window`, an ``(N, 4)`` array, or `Detections`. Parts beyond the right and
+        lower border of the image are cut off before resizing.
+    clf, scaler
+        A fitted classifier with ``predict`` and a fitted scaler with ``transform``, of any kind; None for a
+        classifier of features that are not scaled.
+    hist_range
+        As in `extract_features`; the lesson's code ignores it here.
+    color_space, spatial_size, hist_bins, orient, pix_per_cell, cell_per_block, hog_channel
+        As in `extract_features`, of the features that the classifier was trained on.
+    spatial_feat, hist_feat, hog_feat, transform_sqrt, spatial_order
+        As in `extract_features`.
+
+    Returns
+    -------
+    list
+        The windows, in their order, for which the classifier predicts 1.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed, a window lies outside the image, or the scaler was fitted on another
+        number of features.
+
+    Warns
+    -----
+    UserWarning
+        If the scaler was fitted on values 0-255 and the image has values 0-1, or the other way round.
+
+    Examples
+    --------
+    >>> from sklearn.naive_bayes import GaussianNB
+    >>> from sklearn.preprocessing import StandardScaler
+    >>> from vehicle_detection import render_patches
+    >>> from vehicle_detection.course import extract_features
+    >>> patches, labels = render_patches(20)
+    >>> X = extract_features(patches, "YCrCb", hog_channel="ALL")
+    >>> scaler = StandardScaler().fit(X)
+    >>> clf = GaussianNB().fit(scaler.transform(X), labels)
+    >>> row = np.concatenate([patches[0], patches[-1]], axis=1)
+    >>> windows = [((0, 0), (64, 64)), ((64, 0), (128, 64))]
+    >>> search_windows(row, windows, clf, scaler, "YCrCb", hog_channel="ALL")
+    [((0, 0), (64, 64))]
+    """
+    options, image = FeatureOptions.of(locals()), check_lesson_image(img)
+    estimators = _check_estimators(clf, scaler, options, image)
+    corners = corner_array(windows, "windows")
+    height, width = image.shape[:2]
+    valid = (corners >= 0).all(axis=1) & (corners[:, 0] < width) & (corners[:, 1] < height)
+    valid &= (corners[:, 2:] > corners[:, :2]).all(axis=1)
+    if not valid.all():
+        row = int(np.argmin(valid))
+        raise InvalidInputError(
+            f"windows must be non-empty and start inside the {width}x{height} image; got "
+            f"{corners[row].tolist()} in row {row}"
+        )
+    rows = box_rows(windows)
+    found: list[Any] = []
+    for start in range(0, len(corners), _CHUNK):
+        patches = [
+            np.asarray(cv2.resize(image[y1:y2, x1:x2], (PATCH_SIZE, PATCH_SIZE)))
+            for x1, y1, x2, y2 in corners[start : start + _CHUNK]
+        ]
+        hits = _classify_patches(patches, estimators)
+        found += [rows[start + index] for index in np.flatnonzero(hits)]
+    return found
+
+
+def find_cars(
+    img: Image,
+    ystart: int | None,
+    ystop: int | None,
+    scale: float,
+    svc: Any,
+    X_scaler: Any,
+    orient: int,
+    pix_per_cell: int,
+    cell_per_block: int,
+    spatial_size: Size,
+    hist_bins: int,
+    *,
+    color_space: str = "YCrCb",
+    hog_channel: int | str = "ALL",
+    spatial_feat: bool = True,
+    hist_feat: bool = True,
+    hog_feat: bool = True,
+    hist_range: tuple[float, float] | None = (0, 256),
+    transform_sqrt: bool | None = None,
+    spatial_order: SpatialOrder = "interleaved",
+    cells_per_step: int = 2,
+    divide_by: float = 255,
+    resize: ResizeOrder = "after conversion",
+    formula: Formula = "old",
+) -> Image:
+    """Draw the windows of `find_car_windows` on a copy of the image; the arguments are the same.
+
+    Returns
+    -------
+    numpy.ndarray
+        A new image with blue rectangles, 6 pixels thick.
+
+    Examples
+    --------
+    >>> from sklearn.dummy import DummyClassifier
+    >>> from sklearn.preprocessing import StandardScaler
+    >>> svc = DummyClassifier(strategy="constant", constant=1).fit([[0], [0]], [0, 1])
+    >>> scaler = StandardScaler().fit(np.zeros((2, 8460)))
+    >>> drawn = find_cars(np.zeros((96, 96, 3), np.uint8), 0, 96, 1, svc, scaler, 9, 8, 2, (32, 32), 32)
+    >>> drawn[0, 0].tolist(), drawn[40, 40].tolist()
+    ([0, 0, 255], [0, 0, 0])
+    """
+    boxes = find_car_windows(**locals())  # all arguments
+    drawn: Image = np.array(img, order="C")
+    draw_corners(drawn, np.array(boxes, int).reshape(-1, 4))
+    return drawn
+
+
+def find_car_windows(
+    img: Image,
+    ystart: int | None,
+    ystop: int | None,
+    scale: float,
+    svc: Any,
+    X_scaler: Any,
+    orient: int,
+    pix_per_cell: int,
+    cell_per_block: int,
+    spatial_size: Size,
+    hist_bins: int,
+    *,
+    color_space: str = "YCrCb",
+    hog_channel: int | str = "ALL",
+    spatial_feat: bool = True,
+    hist_feat: bool = True,
+    hog_feat: bool = True,
+    hist_range: tuple[float, float] | None = (0, 256),
+    transform_sqrt: bool | None = None,
+    spatial_order: SpatialOrder = "interleaved",
+    cells_per_step: int = 2,
+    divide_by: float = 255,
+    resize: ResizeOrder = "after conversion",
+    formula: Formula = "old",
+) -> list[Box]:
+    """Search a band of an image at one scale, with one HOG for all windows: the boxes that `find_cars` draws.
+
+    Parameters
+    ----------
+    img
+        ``(H, W, 3)`` RGB.
+    ystart, ystop
+        Rows to search.
+    scale
+        Side of a window divided by 64 pixels: the band is shrunk by this factor.
+    svc, X_scaler
+        A fitted classifier with ``predict`` and a fitted scaler with ``transform``, of any kind; None for a
+        classifier of features that are not scaled.
+    orient, pix_per_cell, cell_per_block, spatial_size, hist_bins
+        As in `extract_features`, of the features that the classifier was trained on.
+    color_space, hog_channel, spatial_feat, hist_feat, hog_feat, hist_range, transform_sqrt, spatial_order
+        As in `extract_features`. The quiz comes with functions that order the bins by channel and take the
+        range of each channel: pass ``spatial_order="channels", hist_range=None`` for a model trained with
+        them.
+    cells_per_step
+        Step between windows, in cells.
+    divide_by
+        Number by which the values are divided first. The quiz divides by 255, for a model trained on PNG
+        files, which ``mpimg.imread`` reads as float 0-1. Pass 1 for a model trained on uint8 images; most
+        published systems remove the division then. A uint8 image is searched by the library's fast search. A
+        float image with values 0-1 is never divided.
+    resize
+        ``"after conversion"``: the quiz converts the colors first and then shrinks the band.
+        ``"before conversion"``: shrink first, as a window-by-window search (`search_windows`) and the main
+        API do. Scores of the two differ by up to 1.7 at scales other than 1.
+    formula
+        Number of steps along an axis; the course has published both. ``"old"``:
+        ``(blocks - blocks per window) // cells_per_step``, which leaves out the last position; ``"new"`` adds
+        one. `set_lesson_defaults` does not change this default: the two versions of `slide_window` are
+        independent of these.
+
+    Returns
+    -------
+    list
+        Corner pairs ``((x1, y1), (x2, y2))`` of the windows for which the classifier predicts 1, column by
+        column, as in the quiz.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed or the scaler was fitted on another number of features.
+
+    Warns
+    -----
+    UserWarning
+        If the scaler was fitted on values 0-255 and the searched values are 0-1, or the other way round.
+
+    Examples
+    --------
+    >>> from sklearn.preprocessing import StandardScaler
+    >>> from sklearn.svm import LinearSVC
+    >>> from vehicle_detection import render_patches
+    >>> from vehicle_detection.course import extract_features
+    >>> patches, labels = render_patches(40)
+    >>> X = extract_features(patches, "YCrCb", (16, 16), hog_channel="ALL")
+    >>> scaler = StandardScaler().fit(X)
+    >>> svc = LinearSVC(random_state=0).fit(scaler.transform(X), labels)
+    >>> frame = np.full((144, 240, 3), 90, np.uint8)
+    >>> frame[32:96, 64:128] = patches[0]
+    >>> boxes = find_car_windows(frame, 0, 144, 1, svc, scaler, 9, 8, 2, (16, 16), 32, divide_by=1)
+    >>> ((64, 32), (128, 96)) in boxes
+    True
+    """
+    options, image = _SearchOptions.of(locals()), check_lesson_image(img)
+    top, bottom = options.rows(image.shape[0])
+    image = _scale_values(image[top:bottom], options.divide_by)
+    estimators = _check_estimators(svc, X_scaler, options, image)
+    if resize == "after conversion":
+        converted = _shrink(convert_color(image, color_space), scale)
+    else:
+        converted = convert_color(_shrink(image, scale), color_space)
+    hits = _search_band(converted, estimators, options)
+    stride, side = cells_per_step * options.pix_per_cell, int(PATCH_SIZE * scale)
+    boxes = []
+    for column, row in np.argwhere(hits.T).tolist():
+        x, y = int(column * stride * scale), int(row * stride * scale) + top
+        boxes.append(((x, y), (x + side, y + side)))
+    return boxes
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SearchOptions(FeatureOptions):
+    """The options of `find_car_windows`, checked."""
+
+    ystart: int | None = integer(None, low=0)
+    ystop: int | None = integer(None, low=0)
+    scale: float = number(above=0, high=1e6)
+    cells_per_step: int = integer(low=1)
+    divide_by: float = number(above=0)
+    resize: str = choice(MISSING, ("after conversion", "before conversion"))
+    formula: str = choice(MISSING, FORMULAS)
+
+    def rows(self, height: int) -> tuple[int, int]:
+        """Rows of the band, clipped to the image's height."""
+        top, bottom = self.ystart or 0, height if self.ystop is None else min(height, self.ystop)
+        if top >= bottom:
+            raise InvalidInputError(
+                f"ystart and ystop must be a range of the image's {height} rows; got {self.ystart} and "
+                f"{self.ystop}"
+            )
+        return top, bottom
+
+
+def _scale_values(image: Image, divide_by: float) -> Image:
+    """Divide an image like the quiz, but not a float image with values 0-1."""
+    if divide_by == 1 or (image.dtype != np.uint8 and image.max() <= 1):
+        return image
+    return image.astype(np.float32) / np.float32(divide_by)
+
+
+def _shrink(image: Image, scale: float) -> Image:
+    if scale == 1:
+        return image
+    height, width = (max(1, int(side / scale)) for side in image.shape[:2])
+    return np.asarray(cv2.resize(image, (width, height)))
+
+
+def _search_band(converted: Image, estimators: _Estimators, options: _SearchOptions) -> NDArray[np.bool_]:
+    """Whether the classifier predicts 1 for each window of a converted band, ``(rows, columns)``."""
+    cell, block, cells_per_step = options.pix_per_cell, options.cell_per_block, options.cells_per_step
+    rows, columns = (
+        (side // cell - block + 1 - options.blocks) // cells_per_step + (options.formula == "new")
+        for side in converted.shape[:2]
+    )
+    if rows < 1 or columns < 1:
+        return np.zeros((0, 0), np.bool_)
+    if estimators.filters is not None:
+        scores = _fast_scores(converted, options, estimators.filters, estimators.workspace)
+        return np.asarray(scores[::cells_per_step, ::cells_per_step][:rows, :columns] > 0)
+    hog = None
+    if options.hog_feat:
+        # A view: (channels, rows, columns, block, block, orient, blocks, blocks), windows at every cell.
+        window = (options.blocks, options.blocks)
+        blocks = hog_blocks(*options.hog_arguments(converted))
+        view = np.lib.stride_tricks.sliding_window_view(blocks, window, axis=(1, 2))
+        hog = view.transpose(1, 2, 0, 6, 7, 3, 4, 5)[::cells_per_step, ::cells_per_step]
+    indices = None
+    if options.hist_feat and options.hist_range is not None:
+        indices = bin_indices(converted, options.hist_bins, options.hist_range)
+    positions = np.indices((rows, columns)).reshape(2, -1).T
+    hits = []
+    for start in range(0, len(positions), _CHUNK):
+        features = np.empty((len(positions[start : start + _CHUNK]), options.length))
+        for vector, (row, column) in zip(features, positions[start:].tolist()):
+            y, x = row * cells_per_step * cell, column * cells_per_step * cell
+            parts = _window_color(converted, indices, y, x, options)
+            if hog is not None:
+                parts.append(hog[row, column].ravel())
+            np.concatenate(parts, out=vector)
+        hits.append(estimators.predict(features))
+    return np.concatenate(hits).reshape(rows, columns)
+
+
+def _window_color(
+    converted: Image, indices: NDArray[np.intp] | None, y: int, x: int, options: FeatureOptions
+) -> list[NDArray[Any]]:
+    """Spatial bins and histogram of the window at ``(x, y)``; `indices` are the band's histogram bins."""
+    part = np.s_[y : y + PATCH_SIZE, x : x + PATCH_SIZE]
+    window = converted[part]
+    if window.shape[:2] != (PATCH_SIZE, PATCH_SIZE):
+        # The border may cut the last window if a cell does not divide 64.
+        return options.color_parts(np.asarray(cv2.resize(window, (PATCH_SIZE, PATCH_SIZE))))
+    parts: list[NDArray[Any]] = []
+    if options.spatial_feat:
+        parts.append(bin_spatial(window, options.spatial_size, order=options.spatial_order))
+    if indices is not None:
+        parts.append(count_bins(indices[part], options.hist_bins))
+    elif options.hist_feat:
+        parts.append(color_hist(window, options.hist_bins, None))
+    return parts
+
+
+def _fast_scores(
+    converted: Image, options: FeatureOptions, filters: BandFilters, workspace: Workspace
+) -> NDArray[np.float32]:
+    """Scores of the windows at every cell by the library's filters."""
+    if converted.dtype == np.uint8 and options.has_library_range:
+        return filters.score_converted(converted, {options.color_space: converted}, workspace)
+    hist, tables = converted, None
+    if options.hist_feat:
+        assert options.hist_range is not None
+        hist = bin_indices(converted, options.hist_bins, options.hist_range)
+        # The last bin, of values out of range, has no weight.
+        tables = np.pad(filters.weights_by_bin, ((0, 0), (0, 0), (0, 1)))
+    maps = []
+    if options.hog_feat:
+        hog = hog_maps(*options.hog_arguments(converted))
+        maps = [hog.reshape(-1, *hog.shape[4:])]
+    return filters.score_maps(maps, converted, hist, tables, workspace)
+
+
+def _classify_patches(patches: list[Image], estimators: _Estimators) -> NDArray[np.bool_]:
+    """Whether the classifier predicts 1 for each of some 64x64 patches."""
+    options, classifier = estimators.options, estimators.classifier
+    if classifier is not None and options.has_library_range and are_uint8_patches(patches):
+        return np.asarray(classifier.decision_function(np.stack(patches)) > 0)
+    return estimators.predict(np.array(options.compute(patches)))
+
+
+@dataclass(frozen=True)
+class _Estimators:
+    """A classifier and its scaler, checked for some features."""
+
+    clf: Any
+    scaler: Any  # None for features that are not scaled
+    options: FeatureOptions
+    state: list[Any] | None  # what scikit-learn's classes compute with; None for other classes
+    classifier: VehicleClassifier | None  # the same as the library's, if it is linear
+    filters: BandFilters | None  # for the fast search, if windows can share the features
+    workspace: Workspace  # of the filters
+    unit_range: bool | None  # whether the scaler was fitted on images with values 0-1; None if unknown
+    spread_histograms: bool  # whether it was fitted on histograms that such images cannot have
+
+    def predict(self, features: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether the classifier predicts 1 for each of ``(N, length)`` feature vectors."""
+        scaled = features if self.scaler is None else self.scaler.transform(features)
+        labels = np.asarray(self.clf.predict(scaled)).reshape(-1)
+        if len(labels) != len(features):
+            raise InvalidInputError(
+                f"the classifier must predict a label for each of {len(features)} windows; got {len(labels)} "
+                f"from {type(self.clf).__name__}.predict"
+            )
+        return np.asarray(labels == 1)
+
+
+# Those of the last call: a system calls `find_cars` for each scale and frame with the same ones.
+_last: _Estimators | None = None
+
+
+def _check_estimators(clf: Any, scaler: Any, options: FeatureOptions, image: Image) -> _Estimators:
+    """Check that a classifier and its scaler fit the features, and the range of an image's values."""
+    global _last
+    clf = getattr(clf, "best_estimator_", clf)  # of a GridSearchCV
+    # Only classes of scikit-learn: others may predict in another way, as does a replaced method.
+    known = all(each is None or type(each).__module__.startswith("sklearn.") for each in (clf, scaler))
+    state: list[Any] | None = None
+    if known and "predict" not in vars(clf):
+        state = [type(clf), type(scaler)]
+        state += [getattr(each, name, None) for each in (clf, scaler) for name in _MODEL_STATE]
+    last = _last
+    if last is None or state is None or last.state is None or last.options != options:
+        found = None
+    else:
+        found = last if all(map(_equal, last.state, state)) else None
+    if found is None:
+        found = _last = _read_estimators(clf, scaler, options, copy.deepcopy(state))
+    elif found.clf is not clf or found.scaler is not scaler:
+        found = dataclasses.replace(found, clf=clf, scaler=scaler)
+    _warn_of_range(found, image)
+    return found
+
+
+def _equal(first: Any, second: Any) -> bool:
+    return np.array_equal(first, second) if isinstance(first, np.ndarray) else bool(first == second)
+
+
+def _read_estimators(clf: Any, scaler: Any, options: FeatureOptions, state: list[Any] | None) -> _Estimators:
+    from sklearn.exceptions import NotFittedError
+    from sklearn.utils.validation import check_is_fitted
+
+    for estimator, name, method in ((clf, "classifier", "predict"), (scaler, "scaler", "transform")):
+        if scaler is None and name == "scaler":
+            continue
+        if not hasattr(estimator, method):
+            raise InvalidInputError(f"the {name} must have a method {method}; got {describe(estimator)}")
+        if type(estimator).__module__.startswith("sklearn."):
+            try:
+                check_is_fitted(estimator)
+            except NotFittedError:
+                raise InvalidInputError(
+                    f"the {name} must be fitted; got an unfitted {type(estimator).__name__}: call fit first"
+                ) from None
+    if options.hog_feat and options.blocks < 1:
+        raise InvalidInputError(
+            f"a block of {options.cell_per_block} cells of {options.pix_per_cell} pixels must fit into a "
+            f"window of {PATCH_SIZE} pixels"
+        )
+    first, name = (clf, "classifier") if scaler is None else (scaler, "scaler")
+    fitted = n_features(first)
+    if fitted not in (None, options.length):
+        raise InvalidInputError(
+            f"the {name} was fitted on {fitted} features, but these options give {options.length}; pass the "
+            "options that the classifier was trained with"
+        )
+    classifier, filters = None, None
+    if state is not None and options.params is not None:
+        steps = [clf] if scaler is None else [scaler, clf]
+        with contextlib.suppress(InvalidInputError):  # not linear, or windows cannot share the features
+            classifier = VehicleClassifier(options.params, (fold_estimators(steps, options.length),))
+            filters = classifier.filters
+    if options.hist_feat and not options.hist_range:
+        filters = None
+    unit_range, spread = _was_fitted_on_unit_range(scaler, options), _has_spread_histograms(scaler, options)
+    return _Estimators(clf, scaler, options, state, classifier, filters, Workspace(), unit_range, spread)
+
+
+def _warn_of_range(estimators: _Estimators, image: Image) -> None:
+    """Warn if the values of an image have another range than those that the scaler was fitted on."""
+    trained_on_unit, options = estimators.unit_range, estimators.options
+    largest = 255.0 if image.dtype == np.uint8 else float(image.max())
+    if largest <= 0.1:
+        return  # an almost black image may have either range
+    if trained_on_unit is not None and (largest <= 2) != trained_on_unit:
+        trained, given = ("0-1", "0-255") if trained_on_unit else ("0-255", "0-1")
+        problem = f"the scaler was fitted on values {trained}, but the image has values {given}"
+    elif largest <= 2 and estimators.spread_histograms:
+        problem = (
+            "the scaler was fitted on histograms with values in many bins, but all values of a 0-1 image are "
+            f"in the first bin of hist_range={options.hist_range}"
+        )
+    else:
+        return
+    warnings.warn(
+        f"{problem}, which makes predictions useless. extract_features and mpimg.imread read a PNG as 0-1 "
+        "and other files as 0-255; find_cars divides by 255 unless divide_by=1 is passed. A model trained "
+        'with the functions of the HOG sub-sampling quiz needs hist_range=None and spatial_order="channels".',
+        stacklevel=_caller_level(),
+    )
+
+
+def _caller_level() -> int:
+    """Return the ``stacklevel`` for a warning of the calling function that names the user's code."""
+    frame, level = sys._getframe(1), 1
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("vehicle_detection."):
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+def _has_spread_histograms(scaler: Any, options: FeatureOptions) -> bool:
+    """Whether a scaler was fitted on histograms with values that channels of a 0-1 image cannot have."""
+    means = getattr(scaler, "mean_", None)
+    channels = list(UNIT_CHANNELS.get(options.color_space, ()))
+    if means is None or not (options.hist_feat and options.hist_range and channels):
+        return False
+    width, height = options.spatial_size
+    start = 3 * width * height if options.spatial_feat else 0
+    counts = means[start : start + 3 * options.hist_bins].reshape(3, -1)[channels]
+    lows = np.linspace(*options.hist_range, options.hist_bins, endpoint=False)
+    return bool(counts[:, lows > _MAX_UNIT].sum() > _MIN_SPREAD * counts.sum())
+
+
+def _was_fitted_on_unit_range(scaler: Any, options: FeatureOptions) -> bool | None:
+    """Whether a scaler was fitted on features of images with values 0-1; None if it does not show it."""
+    means, scales = (getattr(scaler, name, None) for name in ("mean_", "scale_"))
+    if means is None:
+        return None
+    if options.params is not None:
+        scales = np.ones_like(means) if scales is None else scales
+        found = has_unit_range(means, scales, options.params)
+        return found or (False if options.spatial_feat else None)
+    if not options.spatial_feat or len(UNIT_CHANNELS.get(options.color_space, ())) < 3:
+        return None
+    width, height = options.spatial_size
+    return bool(np.max(means[: 3 * width * height]) <= 2)
