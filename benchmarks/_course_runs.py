@@ -127,11 +127,10 @@ class Runs:
         tables = [
             compare_configurations(
                 self.patch_set,
-                {name: params},
+                {name: {**asdict(params), "mirror": False}},
                 splits={part: split},
                 seeds=[seed],
                 C=plan.C,
-                mirror=False,
                 options=options,
                 store=self._svm_rows,
             )

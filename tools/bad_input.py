@@ -31,7 +31,7 @@ import numpy as np
 
 import vehicle_detection as vd
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
-from vehicle_detection.training import to_pipeline
+from vehicle_detection.training import Halving, to_pipeline
 
 MAX_SECONDS = 60
 """Time limit of one call, which may have to compile kernels."""
@@ -340,7 +340,7 @@ class _Valid:
                 "tracks_only": True,
                 "options": {"n_jobs": 1},
             },
-            "search_parameters": {"grid": {"orient": [4]}, "n_folds": 2, "options": quick},
+            "search_parameters": {"grid": {"orient": [4]}, "halving": Halving(n_folds=2), "options": quick},
             "search_windows": {"windows": boxes, "n_jobs": 1},
             "single_img_features": {"image": patches[0]},
             "split_random": {"patches_or_labels": labels},

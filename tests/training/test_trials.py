@@ -26,7 +26,7 @@ PARAMS = FeatureParams(**SMALL)
 def test_a_trial_equals_training_on_that_part(patch_set, mirror, split):
     parts = make_split(patch_set, split, random_state=3)
     table = compare_configurations(
-        patch_set, [SMALL], splits=split, C=0.01, mirror=mirror, seeds=[3], options=UNTIMED
+        patch_set, [{**SMALL, "mirror": mirror}], splits=split, C=0.01, seeds=[3], options=UNTIMED
     )
     (row,) = table.to_dict("records")
     train, test = patch_set[parts.train], patch_set[parts.test]
@@ -61,7 +61,7 @@ def test_a_weight_on_vehicles_finds_more_of_them(patch_set):
 
 def test_features_that_exceed_the_memory_fail(patch_set, monkeypatch):
     monkeypatch.setattr(trials.os, "sysconf", lambda name: 100)
-    table = compare_configurations(patch_set, [SMALL], mirror=False, options=UNTIMED)
+    table = compare_configurations(patch_set, [{**SMALL, "mirror": False}], options=UNTIMED)
     assert table["status"].tolist() == ["failed"]
     message = table["message"][0]
     assert "features of 96 patches needs about 1 GB, but this machine has 0 GB" in message

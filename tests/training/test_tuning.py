@@ -11,6 +11,7 @@ from tests.training.trial_cases import SEARCH, SMALL, SMALL_GRID, UNTIMED, count
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.training import (
+    Halving,
     TrialOptions,
     compare_configurations,
     expand_grid,
@@ -23,9 +24,7 @@ from vehicle_detection.training.tuning import make_folds
 
 
 def compare(patch_set, configurations, **options):
-    return compare_configurations(
-        patch_set, configurations, **{"mirror": False, "options": UNTIMED, **options}
-    )
+    return compare_configurations(patch_set, configurations, **{"options": UNTIMED, **options})
 
 
 # compare_configurations
@@ -62,11 +61,11 @@ def test_own_splits_and_presets_by_name(patch_set):
 
 
 def test_a_configuration_overrides_the_training_options(patch_set):
-    configurations = [{**SMALL, "C": 0.5, "positive_weight": 3.0, "mirror": True}, SMALL]
+    configurations = [{**SMALL, "C": 0.5, "positive_weight": 3.0, "mirror": False}, SMALL]
     table = compare(patch_set, configurations, C=[0.1, 0.2])
     assert table["C"].tolist() == [0.5, 0.1, 0.2]
     assert table["positive_weight"].tolist() == [3.0, 1.0, 1.0]
-    assert table["mirror"].tolist() == [True, False, False]
+    assert table["mirror"].tolist() == [False, True, True]
     assert table["train_size"].nunique() == 1
 
 
@@ -168,14 +167,13 @@ def test_rows_of_other_patches_splits_and_frames_are_not_used(patch_set, frames,
             (patch_set, {"options": on_frames}),
             (patch_set, {"options": searched}),
             (patch_set, {"options": TrialOptions()}),
-            (patch_set, {"mirror": True}),
         ],
         start=2,
     ):
         compare(patches, [SMALL], store=store, **options)
         assert len(tried) == number
     compare(patch_set, [SMALL], store=store)
-    assert len(tried) == 7
+    assert len(tried) == 6
 
 
 def test_an_interrupted_run_continues_from_its_store(patch_set, tmp_path, monkeypatch):
@@ -232,7 +230,7 @@ compare_configurations(patch_set, grid, splits="random", store={str(store)!r}, o
 def test_halving_keeps_the_better_and_measures_the_best_in_full(patch_set, frames):
     grid = {**SMALL_GRID, "orient": [0, 4, 6], "C": [1e-9, 1e-3, 1.0]}
     options = TrialOptions(frames=frames, search_params=SEARCH)
-    table = search_parameters(patch_set, grid, n_finalists=2, n_folds=2, options=options)
+    table = search_parameters(patch_set, grid, halving=Halving(n_finalists=2, n_folds=2), options=options)
     assert table["stage"].unique().tolist() == ["grid", "halving", "final"]
     assert table[table["stage"] == "grid"]["status"].tolist() == ["failed"] * 3
     halving = table[table["stage"] == "halving"]
@@ -266,9 +264,8 @@ def larger(patch_set, times):
 def test_later_rounds_use_fewer_configurations_and_more_patches(patch_set):
     many = larger(patch_set, 8)
     grid = {**SMALL_GRID, "C": [1e-9, 1e-5, 1e-3, 1.0]}
-    table = search_parameters(
-        many, grid, split="random", n_folds=2, factor=2, n_finalists=0, random_state=1, options=UNTIMED
-    )
+    halving = Halving(n_folds=2, factor=2, n_finalists=0)
+    table = search_parameters(many, grid, split="random", halving=halving, random_state=1, options=UNTIMED)
     rounds = table.groupby(table["train_size"] + table["test_size"])["C"].unique()
     assert [len(values) for values in rounds] == [4, 2]
     assert rounds.index[1] == pytest.approx(2 * rounds.index[0], rel=0.01)
@@ -277,7 +274,11 @@ def test_later_rounds_use_fewer_configurations_and_more_patches(patch_set):
 
 def test_candidates_are_drawn_at_random(patch_set):
     grid = {**SMALL_GRID, "C": [10.0**power for power in range(-8, 2)]}
-    options = {"split": "random", "n_candidates": 3, "n_finalists": 1, "options": UNTIMED, "n_folds": 2}
+    options = {
+        "split": "random",
+        "halving": Halving(n_candidates=3, n_finalists=1, n_folds=2),
+        "options": UNTIMED,
+    }
     drawn = []
     for seed in (0, 0, 1):
         table = search_parameters(patch_set, grid, random_state=seed, **options)
@@ -289,7 +290,7 @@ def test_candidates_are_drawn_at_random(patch_set):
 def test_an_interrupted_search_continues_from_its_store(patch_set, tmp_path, monkeypatch):
     many = larger(patch_set, 8)
     grid = {**SMALL_GRID, "C": [1e-5, 1e-4, 1e-3], "orient": [3, 4, 5]}
-    options = {"split": "groups", "n_folds": 2, "n_finalists": 2, "options": UNTIMED}
+    options = {"split": "groups", "halving": Halving(n_folds=2, n_finalists=2), "options": UNTIMED}
     store = tmp_path / "rows.csv"
     with monkeypatch.context() as patched:
         count_trials(patched, stop_after=13)
@@ -314,7 +315,7 @@ def test_a_configuration_that_cannot_be_trained_is_dropped(patch_set, monkeypatc
 
     monkeypatch.setattr(TrialEvaluator, "train", train_others)
     grid = {**SMALL_GRID, "orient": [6, 4]}
-    table = search_parameters(patch_set, grid, split="random", n_folds=2, options=UNTIMED)
+    table = search_parameters(patch_set, grid, split="random", halving=Halving(n_folds=2), options=UNTIMED)
     halving = table[table["stage"] == "halving"]
     assert halving[halving["orient"] == 6]["status"].tolist() == ["failed"] * 2
     assert table[table["stage"] == "final"]["orient"].tolist() == [4]
@@ -350,11 +351,8 @@ def test_folds_cover_all_patches_without_leakage(patch_set, split):
         ({"grid": {"orient": [0, 500]}}, "grid holds no possible combination: orient must be"),
         ({"grid": {"orient": range(1, 181), "hist_bins": range(1, 257), "C": range(1, 9)}}, "at most 100000"),
         ({"split": "gti_to_kitti"}, "split must be one of 'sequences', 'groups', 'random'"),
-        ({"n_folds": 1}, "n_folds must be an integer from 2 to 100"),
-        ({"n_folds": 90, "split": "random"}, "patch_set is too small for n_folds=90"),
-        ({"factor": 1}, "factor must be an integer from 2"),
-        ({"n_finalists": -1}, "n_finalists must be an integer at least 0"),
-        ({"n_candidates": 0}, "n_candidates must be an integer at least 1"),
+        ({"halving": Halving(n_folds=90), "split": "random"}, "patch_set is too small for n_folds=90"),
+        ({"halving": 2}, "halving must be a Halving"),
         ({"random_state": -1}, "random_state must be an integer from 0"),
     ],
 )
@@ -363,8 +361,14 @@ def test_invalid_arguments_of_search_parameters(patch_set, options, message):
         search_parameters(patch_set, **{"grid": {"orient": [4]}, "options": UNTIMED, **options})
 
 
+def test_invalid_numbers_of_halving():
+    for wrong in ({"n_folds": 1}, {"factor": 1}, {"n_finalists": -1}, {"n_candidates": 0}):
+        with pytest.raises(InvalidInputError, match=f"{next(iter(wrong))} must be an integer"):
+            Halving(**wrong)
+
+
 def test_a_fold_with_one_class_is_rejected(patch_set):
     names = [f"all/{row}.png" for row in range(120)]
     sorted_by_class = PatchSet(patch_set.patches, patch_set.labels, names)
     with pytest.raises(InvalidInputError, match=r"fold 1 of n_folds=2, or the rest .* lacks vehicles or"):
-        search_parameters(sorted_by_class, {"orient": [4]}, n_folds=2)
+        search_parameters(sorted_by_class, {"orient": [4]}, halving=Halving(n_folds=2))

@@ -61,6 +61,7 @@ def tune(
     from vehicle_detection._common import check_choice, check_integer
     from vehicle_detection.datasets import load_training_patches
     from vehicle_detection.training import (
+        Halving,
         TrialOptions,
         compare_configurations,
         expand_grid,
@@ -89,7 +90,12 @@ def tune(
         patches = load_training_patches(vehicles, non_vehicles, progress=sys.stderr.isatty())
         if halving:
             return search_parameters(
-                patches, values, split=split, n_finalists=finalists, random_state=seed, **options
+                patches,
+                values,
+                split=split,
+                halving=Halving(n_finalists=finalists),
+                random_state=seed,
+                **options,
             )
         return compare_configurations(patches, expand_grid(values), splits=split, seeds=(seed,), **options)
 

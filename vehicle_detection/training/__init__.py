@@ -15,7 +15,6 @@ from vehicle_detection.training.classifier import (
     patch_features,
     train_classifier,
 )
-from vehicle_detection.training.classifiers import compare_classifiers
 from vehicle_detection.training.feature_cache import FeatureCache, digest_of
 from vehicle_detection.training.frames import (
     FrameDataset,
@@ -25,7 +24,6 @@ from vehicle_detection.training.frames import (
     load_training_frames,
     select_frames,
 )
-from vehicle_detection.training.grid import TrialConfig, expand_grid, parse_grid
 from vehicle_detection.training.mining import mine_negatives
 from vehicle_detection.training.patches import (
     SPLITS,
@@ -48,8 +46,8 @@ from vehicle_detection.training.results import (
     read_results,
     write_results,
 )
-from vehicle_detection.training.trials import TrialOptions
-from vehicle_detection.training.tuning import compare_configurations, search_parameters
+from vehicle_detection.training.trials import TrialConfig, TrialOptions, expand_grid, parse_grid
+from vehicle_detection.training.tuning import compare_classifiers, compare_configurations, search_parameters
 from vehicle_detection.training.validation import (
     FOLD_COLUMNS,
     FoldDetections,
@@ -122,6 +120,7 @@ __all__ = [
     "FoldDetections",
     "FoldScore",
     "FrameDataset",
+    "Halving",
     "NetworkTraining",
     "PatchFeatures",
     "RowStore",

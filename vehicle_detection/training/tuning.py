@@ -1,4 +1,4 @@
-"""Parameter search: compare configurations on several splits, or search a grid by successive halving.
+"""Comparison of configurations and of classifiers on splits, and the search of a grid by successive halving.
 
 Every trial is one row of a table. With a store, each row is on disk as soon as it is measured, so an
 interrupted run continues where it stopped, and a run with more configurations measures only the new ones.
@@ -10,34 +10,41 @@ import math
 import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
+    Checked,
     check_choice,
-    check_flags,
     check_integer,
     check_number,
     check_sequence,
     check_type,
     describe,
+    integer,
     is_listing,
     progress_bar,
 )
 from vehicle_detection.datasets import SEEDED_SPLITS, SPLIT_NAMES, PatchSet, Split, make_split
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.training.classifier import DEFAULT_C
-from vehicle_detection.training.grid import (
+from vehicle_detection.features import FeatureParams
+from vehicle_detection.training.classifier import DEFAULT_C, check_labels
+from vehicle_detection.training.feature_cache import FeatureCache
+from vehicle_detection.training.results import RowStore, make_table
+from vehicle_detection.training.trials import (
+    COLUMNS,
     Configuration,
     TrialConfig,
+    TrialEvaluator,
+    TrialOptions,
+    TrialRunner,
     describe_params,
     expand_grid,
     read_configurations,
 )
-from vehicle_detection.training.results import RowStore
-from vehicle_detection.training.trials import COLUMNS, TrialEvaluator, TrialOptions, TrialRunner
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -53,8 +60,6 @@ def compare_configurations(
     splits: str | Sequence[str] | Mapping[str, Split] = "sequences",
     seeds: Sequence[int] = (0,),
     C: float | Sequence[float] = DEFAULT_C,
-    mirror: bool = True,
-    positive_weight: float = 1.0,
     options: TrialOptions | None = None,
     store: str | os.PathLike[str] | None = None,
     progress: bool = False,
@@ -65,15 +70,14 @@ def compare_configurations(
     ----------
     patch_set, configurations
         The patches; and `FeatureParams`, names of presets, or mappings of fields of `FeatureParams` and of
-        ``C``, ``mirror`` and ``positive_weight``, as a mapping from names or as a list.
+        ``C``, ``mirror`` and ``positive_weight`` of `TrainingOptions`, as a mapping from names or as a list.
     splits, seeds
         One or more of ``"sequences"``, ``"groups"``, ``"random"`` (near duplicates in both parts, like the
         course's split), ``"gti_to_kitti"`` (train on GTI, test on KITTI and Extras) and ``"kitti_to_gti"``;
         or a mapping from names to splits. ``"random"`` and ``"groups"`` give one row per seed; other splits
         use the first.
-    C, mirror, positive_weight
-        Training options of configurations that do not set them; several values of C are all tried. A
-        misclassified vehicle costs `positive_weight` times a misclassified non-vehicle.
+    C
+        Regularization of configurations that do not set it; several values are all tried.
     options, progress
         What is measured besides the accuracy, by default ``TrialOptions()``; and whether to show a progress
         bar on standard error.
@@ -121,16 +125,13 @@ def compare_configurations(
     for value in values:
         check_number(value, "C")
     checked_seeds = check_seeds(seeds)
-    check_flags(mirror=mirror)
-    check_number(positive_weight, "positive_weight", above=0, high=1e6)
     if options is not None:
         check_type(options, "options", TrialOptions, "omit it for the defaults")
-    defaults = {"mirror": mirror, "positive_weight": positive_weight}
     # A configuration that sets C itself is tried with that value only.
     candidates = [
         candidate
         for number, value in enumerate(values)
-        for candidate in read_configurations(configurations, defaults={**defaults, "C": value})
+        for candidate in read_configurations(configurations, C=value)
         if number == 0 or "C" not in candidate.options
     ]
     evaluator = TrialEvaluator(patch_set, options or TrialOptions())
@@ -153,15 +154,34 @@ def compare_configurations(
     return runner.table()
 
 
+@dataclass(frozen=True, kw_only=True)
+class Halving(Checked):
+    """Numbers of a search by successive halving.
+
+    Attributes
+    ----------
+    n_folds
+        Number of folds of the cross-validation.
+    n_candidates
+        Number of combinations to draw at random (``HalvingRandomSearchCV``); None tries all.
+    factor
+        One of `factor` candidates survives a round, and the number of patches grows by `factor`.
+    n_finalists
+        Number of best candidates to measure in full.
+    """
+
+    n_folds: int = integer(3, low=2, high=100)
+    n_candidates: int | None = integer(None, low=1)
+    factor: int = integer(3, low=2, high=100)
+    n_finalists: int = integer(3, low=0)
+
+
 def search_parameters(
     patch_set: PatchSet,
     grid: Mapping[str, Iterable[Any]],
     *,
     split: str = "sequences",
-    n_folds: int = 3,
-    n_candidates: int | None = None,
-    factor: int = 3,
-    n_finalists: int = 3,
+    halving: Halving | None = None,
     random_state: int = 0,
     options: TrialOptions | None = None,
     store: str | os.PathLike[str] | None = None,
@@ -180,14 +200,9 @@ def search_parameters(
     patch_set, grid
         The patches; and lists of values by name: fields of `FeatureParams`, ``C``, ``mirror`` and
         ``positive_weight``. The others keep their defaults. Impossible combinations are reported and skipped.
-    split, n_folds
+    split, halving
         ``"sequences"``, ``"groups"`` or ``"random"``: how the folds and the finalists' split are made; and
-        number of folds.
-    n_candidates
-        Number of combinations to draw at random (``HalvingRandomSearchCV``); None tries all.
-    factor, n_finalists
-        One of `factor` candidates survives a round, and the number of patches grows by `factor`; and number
-        of best candidates to measure in full.
+        the numbers of the search, by default ``Halving()``.
     random_state
         Seed of the draw, the folds and the training. The same seed repeats the search, so that an
         interrupted one continues from its store.
@@ -214,38 +229,33 @@ def search_parameters(
     >>> patches, labels = render_patches(60)
     >>> patch_set = PatchSet(patches, labels, [f"drawn/{number}.png" for number in range(60)])
     >>> grid, untimed = {"orient": [4], "C": [1e-5, 1e-3]}, TrialOptions(time_search=False)
-    >>> table = search_parameters(patch_set, grid, split="random", n_finalists=1, options=untimed)
+    >>> halving = Halving(n_finalists=1)
+    >>> table = search_parameters(patch_set, grid, split="random", halving=halving, options=untimed)
     >>> table["stage"].value_counts().to_dict()
     {'halving': 6, 'final': 1}
     """
     check_choice(split, "split", ("sequences", "groups", "random"))
-    check_integer(n_folds, "n_folds", low=2, high=100)
-    check_integer(factor, "factor", low=2, high=100)
-    check_integer(n_finalists, "n_finalists", low=0)
+    halving = Halving() if halving is None else halving
+    check_type(halving, "halving", Halving, "omit it for the default")
     seed = check_integer(random_state, "random_state", low=0, high=2**32 - 1)
     if options is not None:
         check_type(options, "options", TrialOptions, "omit it for the defaults")
-    if n_candidates is not None:
-        check_integer(n_candidates, "n_candidates", low=1)
-    defaults = {"C": DEFAULT_C, "mirror": True, "positive_weight": 1.0}
-    candidates = read_configurations(expand_grid(grid), defaults=defaults)
+    candidates = read_configurations(expand_grid(grid), C=DEFAULT_C)
     names = {each.config: each.name for each in candidates if each.config is not None}
     if not names:
         raise InvalidInputError(f"grid holds no possible combination: {candidates[0].error}")
     evaluator = TrialEvaluator(patch_set, options or TrialOptions())
     rows = RowStore(store, COLUMNS)
-    fold_of = make_folds(patch_set, split, n_folds, seed)
+    fold_of = make_folds(patch_set, split, halving.n_folds, seed)
     with progress_bar(progress, unit="trial") as bar:
         runner = TrialRunner(evaluator, rows, bar)
         for candidate in candidates:
             if candidate.config is None:
                 runner.add_failed(candidate, stage="grid")
-        ranked = _halve(
-            runner, list(names), fold_of, split=split, n_candidates=n_candidates, factor=factor, seed=seed
-        )
-        if n_finalists:
+        ranked = _halve(runner, list(names), fold_of, halving, split=split, seed=seed)
+        if halving.n_finalists:
             ((name, _, parts),) = make_splits(patch_set, split, (seed,))
-            for config in ranked[:n_finalists]:
+            for config in ranked[: halving.n_finalists]:
                 runner.run(config, parts, seed, name=names[config], split_name=name, stage="final")
     return runner.table()
 
@@ -279,10 +289,9 @@ def _halve(
     runner: TrialRunner,
     configs: Sequence[TrialConfig],
     fold_of: NDArray[np.intp],
+    halving: Halving,
     *,
     split: str,
-    n_candidates: int | None,
-    factor: int,
     seed: int,
 ) -> list[TrialConfig]:
     """Drop the worse configurations round by round, on more and more patches; return them best first."""
@@ -291,7 +300,8 @@ def _halve(
 
     # One parameter that holds whole configurations: impossible combinations are never candidates.
     values: dict[str, Any] = {"config": list(configs)}
-    count = min(n_candidates or len(configs), len(configs))
+    count = min(halving.n_candidates or len(configs), len(configs))
+    factor = halving.factor
     n_rounds = int(math.log(count, factor) + 1e-9)
     n_patches = len(fold_of)
     options: dict[str, Any] = {
@@ -383,3 +393,126 @@ def check_seeds(seeds: object) -> tuple[int, ...]:
             f"seeds must be a list of different integers, such as range(5); got {describe(seeds)}"
         )
     return checked
+
+
+def compare_classifiers(
+    patch_set: PatchSet,
+    classifiers: Mapping[str, Any] | None = None,
+    *,
+    params: FeatureParams | None = None,
+    splits: str | Sequence[str] | Mapping[str, Split] = "sequences",
+    seeds: Sequence[int] = (0,),
+    cache: FeatureCache | str | os.PathLike[str] | None = None,
+    n_jobs: int | None = None,
+    progress: bool = False,
+) -> DataFrame:
+    """Train and evaluate classifiers of scikit-learn on the same features and splits.
+
+    The features are scaled by a ``StandardScaler`` that is fitted on the training part, as in the course.
+
+    Parameters
+    ----------
+    patch_set
+        The patches.
+    classifiers
+        Estimators of scikit-learn by name; they are copied, not changed. None compares Gaussian naive Bayes
+        with a linear SVM.
+    params
+        The features; the default is ``FeatureParams()``.
+    splits, seeds, progress
+        As in `compare_configurations`.
+    cache, n_jobs
+        As in `TrialOptions`.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row for each classifier and split, with the columns ``classifier``, ``split``, ``seed``,
+        ``train_size`` and ``test_size`` (patches), ``accuracy``, ``false_negative_rate``,
+        ``false_positive_rate``, ``fit_seconds`` and ``predict_seconds`` (of all test patches).
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed, or the training part of a split lacks a class.
+
+    Examples
+    --------
+    >>> from sklearn.tree import DecisionTreeClassifier
+    >>> from sklearn.naive_bayes import GaussianNB
+    >>> from vehicle_detection import render_patches
+    >>> patches, labels = render_patches(60)
+    >>> patch_set = PatchSet(patches, labels, [f"drawn/{number}.png" for number in range(60)])
+    >>> models = {"naive Bayes": GaussianNB(), "tree": DecisionTreeClassifier(random_state=0)}
+    >>> table = compare_classifiers(patch_set, models, splits="random", seeds=range(2))
+    >>> table["classifier"].tolist()
+    ['naive Bayes', 'naive Bayes', 'tree', 'tree']
+    """
+    from sklearn.model_selection import cross_validate
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    models = _default_classifiers() if classifiers is None else _check_classifiers(classifiers)
+    if params is not None:
+        check_type(params, "params", FeatureParams, "pass FeatureParams() or a preset")
+    chosen = params or FeatureParams()
+    trials = list(make_splits(patch_set, splits, check_seeds(seeds)))
+    evaluator = TrialEvaluator(patch_set, TrialOptions(cache=cache, n_jobs=n_jobs, time_search=False))
+    for _, _, split in trials:
+        check_labels(evaluator.labels[split.train], len(split.train))
+    X, rows = evaluator.cache.all(chosen), []
+    with progress_bar(progress, len(models), unit="classifier") as bar:
+        for name, model in models.items():
+            scores = cross_validate(
+                make_pipeline(StandardScaler(), model),
+                X,
+                evaluator.labels,
+                cv=[tuple(split) for _, _, split in trials],
+                scoring=_score_classifier,
+                error_score="raise",
+            )
+            for number, (split_name, seed, split) in enumerate(trials):
+                sizes = {"train_size": len(split.train), "test_size": len(split.test)}
+                measured = {key: scores[f"test_{key}"][number] for key in _ERROR_RATES}
+                times = {"fit_seconds": scores["fit_time"], "predict_seconds": scores["score_time"]}
+                seconds = {key: round(float(values[number]), 3) for key, values in times.items()}
+                columns = {"classifier": name, "split": split_name, "seed": seed}
+                rows.append({**columns, **sizes, **measured, **seconds})
+            bar.update()
+    return make_table(rows)
+
+
+_ERROR_RATES = ("accuracy", "false_negative_rate", "false_positive_rate")
+
+
+def _score_classifier(model: Any, X: NDArray[np.float32], y: NDArray[np.int64]) -> dict[str, float]:
+    """Values of `_ERROR_RATES`; NaN without patches of the class."""
+    wrong = np.asarray(model.predict(X)) != y
+    rates = [float(wrong[y == label].mean()) if (y == label).any() else math.nan for label in (1, 0)]
+    return dict(zip(_ERROR_RATES, (float(1 - wrong.mean()), *rates)))
+
+
+def _default_classifiers() -> dict[str, Any]:
+    from sklearn.naive_bayes import GaussianNB
+    from sklearn.svm import LinearSVC
+
+    return {"naive Bayes": GaussianNB(), "linear SVM": LinearSVC(C=DEFAULT_C, random_state=0)}
+
+
+def _check_classifiers(classifiers: Mapping[str, Any]) -> dict[str, Any]:
+    given: object = classifiers
+    if not isinstance(given, Mapping) or not given:
+        raise InvalidInputError(
+            "classifiers must map names to estimators of scikit-learn, at least one, such as "
+            f"{{'naive Bayes': GaussianNB()}}; got {describe(given)}"
+        )
+    for name, model in given.items():
+        # `sklearn.base.clone` needs get_params.
+        if isinstance(model, type) or not all(
+            hasattr(model, each) for each in ("fit", "predict", "get_params")
+        ):
+            raise InvalidInputError(
+                f"classifiers[{name!r}] must be an estimator with fit, predict and get_params, got "
+                f"{describe(model)}; pass an instance, such as GaussianNB()"
+            )
+    return {str(name): model for name, model in given.items()}
