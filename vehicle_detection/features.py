@@ -509,11 +509,6 @@ def extract_features(
     numpy.ndarray
         ``(N, params.length)`` float32.
 
-    Raises
-    ------
-    InvalidInputError
-        If a patch is not uint8 RGB of 64x64 pixels, or a file is missing or unreadable.
-
     Examples
     --------
     >>> extract_features(np.zeros((5, 64, 64, 3), np.uint8)).shape

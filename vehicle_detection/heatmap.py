@@ -217,11 +217,6 @@ def apply_threshold(heatmap: Heat, threshold: float) -> Heat:
     numpy.ndarray
         The same array, `heatmap`.
 
-    Raises
-    ------
-    InvalidInputError
-        If the map is not two-dimensional or is read-only, or the threshold is not a number.
-
     Examples
     --------
     >>> heat = np.array([[1.0, 2.0, 3.0]])
@@ -249,11 +244,6 @@ def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, peak_fraction:
     -------
     Detections
         ``(N, 4)`` int64 boxes and the heat of their peaks, ordered from top to bottom.
-
-    Raises
-    ------
-    InvalidInputError
-        If the map is not two-dimensional or a number is out of range.
 
     Examples
     --------

@@ -143,11 +143,6 @@ class VehicleClassifier:
         -------
         numpy.ndarray
             ``(N,)`` float64; with several templates, the maximum of their scores.
-
-        Raises
-        ------
-        InvalidInputError
-            If the vectors are of another length or hold NaN.
         """
         features = self._features_of(X)
         folded = [template.fold() for template in self.templates]
@@ -176,11 +171,6 @@ class VehicleClassifier:
         -------
         float
             In [0, 1].
-
-        Raises
-        ------
-        InvalidInputError
-            If `X` is malformed or empty, or `y` is of another length.
         """
         labels, predicted = check_array(y, "y"), self.predict(X)
         if labels.shape != predicted.shape or not labels.size:
@@ -291,11 +281,6 @@ class VehicleClassifier:
         -------
         FrameSearch
             A thread-safe context manager; its parameters are `SearchParams`.
-
-        Raises
-        ------
-        InvalidInputError
-            If windows cannot share the features.
         """
         return BandSearch(self.filters, n_jobs)
 
@@ -308,13 +293,7 @@ class VehicleClassifier:
         return title, {name: str(value) for name, value in asdict(self.params).items()}
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the model as a safetensors file (tensors and JSON, no pickle).
-
-        Raises
-        ------
-        InvalidInputError
-            If the folder is missing or read-only, or `metadata` holds other values than JSON.
-        """
+        """Write the model as a safetensors file (tensors and JSON, no pickle)."""
         tensors = {
             f"{index}.{name}": np.array(value, np.float64, ndmin=1)
             for index, template in enumerate(self.templates)
@@ -390,13 +369,7 @@ def flatten_steps(model: Any) -> list[Any]:
 
 
 def fold_estimators(steps: Sequence[Any], length: int) -> Template:
-    """Fold fitted scalers and, last, a linear classifier of vectors of `length` into a template.
-
-    Raises
-    ------
-    InvalidInputError
-        If a step is of another kind, not fitted, or fitted on vectors of another length or other labels.
-    """
+    """Fold fitted scalers and, last, a linear classifier of vectors of `length` into a template."""
     if not steps:
         raise InvalidInputError("pipeline must end in a linear classifier; got no step")
     *scalers, classifier = steps
@@ -499,11 +472,6 @@ def check_uint8(template: Template, params: FeatureParams) -> None:
 
     Such a template is useless for uint8 images. Its spatial bins can be converted, but not the HOG of a color
     channel, whose small differences the rounding to uint8 removes.
-
-    Raises
-    ------
-    InvalidInputError
-        If the spatial bins, or the histogram where all values are in the first bins, show it.
     """
     if has_unit_range(template.mean, template.scale, params):
         raise InvalidInputError(

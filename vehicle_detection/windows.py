@@ -107,11 +107,6 @@ def slide_window(
         ``(N, 4)`` int64 ``[x1, y1, x2, y2]``, row by row: every window of the grid that fits into the region.
         ``+`` joins two such arrays, as it joins the lists of the course.
 
-    Raises
-    ------
-    InvalidInputError
-        If the region exceeds the image, or a window size or overlap is out of range.
-
     Examples
     --------
     >>> slide_window(np.zeros((64, 128, 3), np.uint8), xy_window=(64, 64)).tolist()
@@ -182,11 +177,6 @@ def search_windows(
     -------
     Detections
         The windows and their scores, in the same order.
-
-    Raises
-    ------
-    InvalidInputError
-        If a window exceeds the image or is empty.
     """
     check_image(image)
     check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
@@ -246,11 +236,6 @@ def find_cars(
     -------
     Detections
         Float boxes in pixels of the image and scores, ordered by band and row.
-
-    Raises
-    ------
-    InvalidInputError
-        If the image is malformed or smaller than a window, or windows cannot share the features exactly.
 
     Examples
     --------

@@ -144,11 +144,6 @@ class HeatmapDetector(VehicleDetector):
         -------
         numpy.ndarray
             A new frame of the same shape.
-
-        Raises
-        ------
-        InvalidInputError
-            If an argument is malformed.
         """
         if self.diagnostics:
             return super().annotate(frame, result)

@@ -146,11 +146,6 @@ def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
     numpy.ndarray
         A new image, uint8 or float32.
 
-    Raises
-    ------
-    InvalidInputError
-        If the image is malformed or the conversion is unknown.
-
     Examples
     --------
     >>> convert_color(np.full((1, 1, 3), 200, np.uint8)).tolist()
@@ -207,11 +202,6 @@ def get_hog_features(
         for a float32 image. Blocks are normalized by L2-Hys, scikit-image's default since version 0.15.
     hog_image : numpy.ndarray
         ``(H, W)``, only with `vis`.
-
-    Raises
-    ------
-    InvalidInputError
-        If the image is not one channel or smaller than a block.
 
     Examples
     --------

@@ -108,12 +108,6 @@ def search_windows(
     list
         The windows, in their order, for which the classifier predicts 1.
 
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, a window lies outside the image, or the scaler was fitted on another
-        number of features.
-
     Warns
     -----
     UserWarning
@@ -274,11 +268,6 @@ def find_car_windows(
     list
         Corner pairs ``((x1, y1), (x2, y2))`` of the windows for which the classifier predicts 1, column by
         column, as in the quiz.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed or the scaler was fitted on another number of features.
 
     Warns
     -----

@@ -203,11 +203,6 @@ def extract_features(
         the library's kernels compute, float64 for others. The lesson's code converts the stacked vectors to
         float64 itself.
 
-    Raises
-    ------
-    InvalidInputError
-        If an image is malformed, a file is missing or unreadable, or an option is out of range.
-
     Examples
     --------
     >>> images = [np.zeros((64, 64, 3), np.uint8)] * 2

@@ -52,11 +52,6 @@ def slide_window(
     list
         Corner pairs ``((x1, y1), (x2, y2))``.
 
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed or the step between windows is less than a pixel.
-
     Examples
     --------
     >>> slide_window(np.zeros((64, 128, 3)), xy_overlap=(0.5, 0))
@@ -167,11 +162,6 @@ def add_heat(heatmap: NDArray[Any], bbox_list: Any) -> NDArray[Any]:
     -------
     numpy.ndarray
         The same array, `heatmap`.
-
-    Raises
-    ------
-    InvalidInputError
-        If the map is not a writable 2-D array of numbers or the boxes are malformed.
 
     Examples
     --------

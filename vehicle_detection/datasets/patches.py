@@ -45,11 +45,6 @@ class PatchSet:
         ``(N,)`` bool, True for a vehicle (may be given as 0 and 1); and N strings ``set/folder/file``, such
         as ``vehicles/GTI_Far/image0000.png``.
 
-    Raises
-    ------
-    InvalidInputError
-        If the attributes differ in length or have a wrong type.
-
     Examples
     --------
     >>> names = ["vehicles/KITTI/1.png", "vehicles/KITTI/2.png", "non-vehicles/GTI/1.png"]

@@ -233,11 +233,6 @@ def split_sources(
     Split
         The rows of the named sources.
 
-    Raises
-    ------
-    InvalidInputError
-        If a prefix matches no source, both parts match the same source, or a part lacks a class.
-
     Examples
     --------
     >>> names = ["v/GTI_Far/1.png", "n/GTI/1.png", "v/KITTI_extracted/1.png", "n/Extras/1.png"]
@@ -302,11 +297,6 @@ def find_near_duplicates(
     -------
     numpy.ndarray
         ``(M, 2)`` row numbers: each patch that has a near duplicate, ascending, and the most similar patch.
-
-    Raises
-    ------
-    InvalidInputError
-        If `patches` has another shape or type, or `threshold` is out of range.
 
     Examples
     --------
@@ -379,11 +369,6 @@ def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95)
     -------
     float
         In [0, 1]; 0 for a split by `split_groups` at this threshold or a lower one.
-
-    Raises
-    ------
-    InvalidInputError
-        If `split` holds rows that `patch_set` does not have, or `threshold` is out of range.
 
     Examples
     --------

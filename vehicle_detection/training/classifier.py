@@ -118,12 +118,6 @@ def train_classifier(
         A model with one template. Its metadata also hold the training options and the versions of libraries.
         The same input and seed give the same model.
 
-    Raises
-    ------
-    InvalidInputError
-        If a patch is malformed, the labels do not match the patches, a class is missing, or the estimator is
-        not linear.
-
     Examples
     --------
     >>> from vehicle_detection import render_patches

@@ -63,11 +63,6 @@ def mine_negatives(
         ``non-vehicles/<source>/<frame>_<x1>_<y1>_<side>.png``; may be empty. `PatchSet.concatenate` appends
         them to the training patches.
 
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, or `labels` holds none of the frames.
-
     Examples
     --------
     >>> from vehicle_detection import load_classifier

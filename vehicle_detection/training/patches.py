@@ -162,11 +162,6 @@ def train_and_evaluate(
     report : TrainingReport
         All results, and the time of each step.
 
-    Raises
-    ------
-    InvalidInputError
-        If an argument is out of range, a class is missing, or the patches do not allow `split`.
-
     Examples
     --------
     >>> from vehicle_detection import render_patches

@@ -77,11 +77,6 @@ def pareto_front(table: DataFrame, quality: str = "accuracy", cost: str = "searc
     pandas.DataFrame
         The selected rows, cheapest first, with their index.
 
-    Raises
-    ------
-    InvalidInputError
-        If a column is missing or not numeric.
-
     Examples
     --------
     >>> import pandas as pd

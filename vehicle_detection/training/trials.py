@@ -219,11 +219,6 @@ class TrialOptions:
         Folder that keeps features between runs, or a `FeatureCache` of the same patches; and threads of the
         feature extraction.
 
-    Raises
-    ------
-    InvalidInputError
-        If `frames` holds anything else than labelled frames, or two sets of the same name.
-
     Examples
     --------
     >>> TrialOptions(time_search=False).frame_sets

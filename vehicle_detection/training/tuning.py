@@ -431,11 +431,6 @@ def compare_classifiers(
         ``train_size`` and ``test_size`` (patches), ``accuracy``, ``false_negative_rate``,
         ``false_positive_rate``, ``fit_seconds`` and ``predict_seconds`` (of all test patches).
 
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, or the training part of a split lacks a class.
-
     Examples
     --------
     >>> from sklearn.tree import DecisionTreeClassifier
