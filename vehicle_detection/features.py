@@ -239,6 +239,8 @@ def convert_color(
 ) -> NDArray[np.uint8]:
     """Convert an RGB image to another color space, with OpenCV's 8-bit ranges.
 
+    Returns ``(H, W, 3)`` uint8; a copy, also for ``"RGB"``.
+
     Parameters
     ----------
     image
@@ -248,11 +250,6 @@ def convert_color(
         course's spelling ``"RGB2YCrCb"`` is also accepted.
     out
         Output array of the image's shape; None allocates one.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(H, W, 3)`` uint8; a copy, also for ``"RGB"``.
 
     Examples
     --------
@@ -332,6 +329,8 @@ def get_hog_features(
 
     Dalal and Triggs, "Histograms of oriented gradients for human detection" (CVPR 2005).
 
+    Returns 1-D float64 in [0, 1], in the order block row, block column, cell row, cell column, orientation.
+
     Parameters
     ----------
     img
@@ -342,11 +341,6 @@ def get_hog_features(
         Side lengths of a cell in pixels and of a block in cells.
     transform_sqrt
         Use the square root of the pixel values.
-
-    Returns
-    -------
-    numpy.ndarray
-        1-D float64 in [0, 1], in the order block row, block column, cell row, cell column, orientation.
 
     Examples
     --------
@@ -361,15 +355,12 @@ def hog_image(
 ) -> NDArray[np.float64]:
     """Visualize the orientation histogram of each cell as a star of lines.
 
+    Returns ``(H, W)`` float64, for ``plt.imshow``.
+
     Parameters
     ----------
     img, orient, pix_per_cell, transform_sqrt
         As in `get_hog_features`.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(H, W)`` float64, for ``plt.imshow``.
     """
     from skimage.feature import hog
 
@@ -388,6 +379,8 @@ def bin_spatial(
 ) -> NDArray[np.uint8]:
     """Pixel values of a downscaled image.
 
+    Returns ``(width * height * 3,)`` uint8.
+
     Parameters
     ----------
     img
@@ -396,11 +389,6 @@ def bin_spatial(
         Width and height to scale to, or an integer for both.
     order
         ``"channels"``: one channel after the other; ``"interleaved"``: pixel by pixel.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(width * height * 3,)`` uint8.
 
     Examples
     --------
@@ -420,17 +408,14 @@ def bin_spatial(
 def color_hist(img: NDArray[np.uint8], nbins: int = 32) -> NDArray[np.int64]:
     """Concatenated histograms of the channels over 0-255.
 
+    Returns ``(3 * nbins,)`` int64 counts.
+
     Parameters
     ----------
     img
         ``(H, W, 3)`` uint8 in any color space.
     nbins
         Number of bins of each channel.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(3 * nbins,)`` int64 counts.
 
     Examples
     --------
@@ -446,17 +431,15 @@ def color_hist(img: NDArray[np.uint8], nbins: int = 32) -> NDArray[np.int64]:
 def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None = None) -> NDArray[np.float64]:
     """Feature vector of one 64x64 patch, computed by the reference functions.
 
+    Returns ``(params.length,)`` float64, ``[spatial | histogram | HOG | coarse HOG]``, each channel by
+    channel.
+
     Parameters
     ----------
     image
         ``(64, 64, 3)`` uint8 RGB.
     params
         Features to compute; the default is ``FeatureParams()``.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(params.length,)`` float64, ``[spatial | histogram | HOG | coarse HOG]``, each channel by channel.
 
     Examples
     --------
@@ -492,6 +475,8 @@ def extract_features(
 ) -> NDArray[np.float32]:
     """Feature vectors of many patches, equal to those of `single_img_features`.
 
+    Returns ``(N, params.length)`` float32.
+
     Parameters
     ----------
     source
@@ -503,11 +488,6 @@ def extract_features(
         Number of threads, without effect on the result; None uses ``VEHICLE_DETECTION_JOBS`` or all cores.
     progress
         Show a progress bar on standard error.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(N, params.length)`` float32.
 
     Examples
     --------

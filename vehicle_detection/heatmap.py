@@ -139,6 +139,8 @@ def add_heat(heatmap: Heat, boxes: Detections | ArrayLike, *, scores: ArrayLike 
     A window is added as four corner differences, and one cumulative sum follows, so the cost does not depend
     on the area of the windows.
 
+    Returns the same array, `heatmap`.
+
     Parameters
     ----------
     heatmap
@@ -147,11 +149,6 @@ def add_heat(heatmap: Heat, boxes: Detections | ArrayLike, *, scores: ArrayLike 
         ``(N, 4)`` windows, which are rounded to whole pixels and clipped to the map.
     scores
         ``(N,)`` heat that each window adds; by default 1 each, as in the course.
-
-    Returns
-    -------
-    numpy.ndarray
-        The same array, `heatmap`.
 
     Raises
     ------
@@ -207,15 +204,12 @@ def _check_holds(values: NDArray[np.float64], dtype: np.dtype[Any]) -> None:
 def apply_threshold(heatmap: Heat, threshold: float) -> Heat:
     """Set heat at or below the threshold to zero, in place.
 
+    Returns the same array, `heatmap`.
+
     Parameters
     ----------
     heatmap, threshold
         ``(H, W)`` map, which is changed, and the highest heat that is removed.
-
-    Returns
-    -------
-    numpy.ndarray
-        The same array, `heatmap`.
 
     Examples
     --------
@@ -231,6 +225,8 @@ def apply_threshold(heatmap: Heat, threshold: float) -> Heat:
 def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, peak_fraction: float = 0.0) -> Detections:
     """Find the connected regions of a heat map and their bounding boxes.
 
+    Returns ``(N, 4)`` int64 boxes and the heat of their peaks, ordered from top to bottom.
+
     Parameters
     ----------
     heatmap, threshold
@@ -239,11 +235,6 @@ def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, peak_fraction:
         0 gives the box of the whole region, as in the course. Otherwise the box of the part around the
         region's peak that has at least this fraction of the peak's heat, in [0, 1): windows extend beyond
         the vehicle, where the heat is lower.
-
-    Returns
-    -------
-    Detections
-        ``(N, 4)`` int64 boxes and the heat of their peaks, ordered from top to bottom.
 
     Examples
     --------
@@ -279,6 +270,8 @@ def _connected_components(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], N
 def bounding_boxes(shape: tuple[int, ...], windows: Any, *, params: HeatParams | None = None) -> Detections:
     """Find the boxes of a frame's positive windows: heat map, threshold and labels in one call.
 
+    Returns boxes and the heat of their peaks.
+
     Parameters
     ----------
     shape, windows
@@ -286,11 +279,6 @@ def bounding_boxes(shape: tuple[int, ...], windows: Any, *, params: HeatParams |
         ``weighting="count"``.
     params
         By default ``HeatParams()``. Without a threshold in it, that for the windows of `find_cars`.
-
-    Returns
-    -------
-    Detections
-        Boxes and the heat of their peaks.
 
     Raises
     ------

@@ -134,15 +134,12 @@ class VehicleClassifier:
     def decision_function(self, X: ArrayLike) -> NDArray[np.float64]:
         """Score of each patch: its signed distance from the separating hyperplane, positive for a vehicle.
 
+        Returns ``(N,)`` float64; with several templates, the maximum of their scores.
+
         Parameters
         ----------
         X
             ``(N, length)`` feature vectors, or ``(N, 64, 64, 3)`` uint8 RGB patches.
-
-        Returns
-        -------
-        numpy.ndarray
-            ``(N,)`` float64; with several templates, the maximum of their scores.
         """
         features = self._features_of(X)
         folded = [template.fold() for template in self.templates]
@@ -160,17 +157,14 @@ class VehicleClassifier:
     def score(self, X: ArrayLike, y: ArrayLike) -> float:
         """Accuracy: fraction of correct predictions.
 
+        Returns a fraction in [0, 1].
+
         Parameters
         ----------
         X
             As in `decision_function`.
         y
             ``(N,)`` labels, 1 for a vehicle, 0 otherwise.
-
-        Returns
-        -------
-        float
-            In [0, 1].
         """
         labels, predicted = check_array(y, "y"), self.predict(X)
         if labels.shape != predicted.shape or not labels.size:
@@ -206,6 +200,8 @@ class VehicleClassifier:
 
         Scores equal the classifier's ``decision_function``.
 
+        Returns a model with one template.
+
         Parameters
         ----------
         pipeline
@@ -220,11 +216,6 @@ class VehicleClassifier:
             does not depend on the order, so that a wrong one cannot be detected, but the scores are wrong.
         metadata
             JSON values to keep in the model file.
-
-        Returns
-        -------
-        VehicleClassifier
-            A model with one template.
 
         Raises
         ------
@@ -272,15 +263,12 @@ class VehicleClassifier:
     def open_search(self, n_jobs: int | None = None) -> BandSearch:
         """Open a search of frames with this model.
 
+        Returns a thread-safe context manager; its parameters are `SearchParams`.
+
         Parameters
         ----------
         n_jobs
             Threads; the result does not depend on them.
-
-        Returns
-        -------
-        FrameSearch
-            A thread-safe context manager; its parameters are `SearchParams`.
         """
         return BandSearch(self.filters, n_jobs)
 
@@ -305,15 +293,12 @@ class VehicleClassifier:
 def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassifier:
     """Load a patch classifier from a model file, or the shipped model ``"highway"``.
 
+    Returns the model with its feature parameters and metadata.
+
     Parameters
     ----------
     path
         A ``.safetensors`` file written by `VehicleClassifier.save`; None loads ``"highway"``.
-
-    Returns
-    -------
-    VehicleClassifier
-        The model with its feature parameters and metadata.
 
     Raises
     ------

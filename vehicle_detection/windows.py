@@ -90,6 +90,9 @@ def slide_window(
 ) -> WindowArray:
     """List the windows of one size over a region of the image.
 
+    Returns ``(N, 4)`` int64 ``[x1, y1, x2, y2]``, row by row: every window of the grid that fits into the
+    region. ``+`` joins two such arrays, as it joins the lists of the course.
+
     Parameters
     ----------
     image
@@ -100,12 +103,6 @@ def slide_window(
         Width and height of a window.
     xy_overlap
         Horizontal and vertical overlap of neighboring windows as a fraction of their size, in [0, 1).
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(N, 4)`` int64 ``[x1, y1, x2, y2]``, row by row: every window of the grid that fits into the region.
-        ``+`` joins two such arrays, as it joins the lists of the course.
 
     Examples
     --------
@@ -160,6 +157,8 @@ def search_windows(
 ) -> Detections:
     """Classify each window of a list, of any size, as a patch.
 
+    Returns the windows and their scores, in the same order.
+
     Parameters
     ----------
     image
@@ -172,11 +171,6 @@ def search_windows(
         Minimum score of the returned windows (exclusive); None returns all.
     n_jobs
         Threads.
-
-    Returns
-    -------
-    Detections
-        The windows and their scores, in the same order.
     """
     check_image(image)
     check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
@@ -220,6 +214,8 @@ def find_cars(
     A band is resized once, and its windows share their features. Gradients are zero at the band's border, and
     not at a window's as in `search_windows`; `vehicle_detection.course.reference` gives the same scores.
 
+    Returns float boxes in pixels of the image and scores, ordered by band and row.
+
     Parameters
     ----------
     image
@@ -231,11 +227,6 @@ def find_cars(
         are rounded to whole cells, at least one.
     n_jobs
         Threads, each of which searches a band; the result does not depend on them.
-
-    Returns
-    -------
-    Detections
-        Float boxes in pixels of the image and scores, ordered by band and row.
 
     Examples
     --------

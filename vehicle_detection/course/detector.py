@@ -135,15 +135,12 @@ class HeatmapDetector(VehicleDetector):
     def annotate(self, frame: NDArray[np.uint8], result: FrameResult) -> NDArray[np.uint8]:
         """Draw the boxes of the hot regions on a copy of the frame, in the course's style.
 
+        Returns a new frame of the same shape.
+
         Parameters
         ----------
         frame, result
             As in `VehicleDetector.annotate`.
-
-        Returns
-        -------
-        numpy.ndarray
-            A new frame of the same shape.
         """
         if self.diagnostics:
             return super().annotate(frame, result)

@@ -131,6 +131,8 @@ def check_range(limits: Any, name: str) -> tuple[float, float] | None:
 def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
     """Convert the color space of an image, by the name of OpenCV's conversion.
 
+    Returns a new image, uint8 or float32.
+
     Parameters
     ----------
     img
@@ -140,11 +142,6 @@ def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
         ``"RGB2YCrCb"``, ``"BGR2YCrCb"``, ``"RGB2LUV"``, ``"RGB2HLS"``, ``"RGB2GRAY"``, ..., or an inverse
         such as ``"YCrCb2RGB"``, in upper or lower case; a color space alone, such as ``"LUV"``, means from
         RGB.
-
-    Returns
-    -------
-    numpy.ndarray
-        A new image, uint8 or float32.
 
     Examples
     --------
@@ -244,6 +241,8 @@ def bin_spatial(
 ) -> NDArray[Any]:
     """Pixel values of a resized image as a vector.
 
+    Returns ``(width * height * 3,)``, or ``(width * height,)`` of one channel, of the image's dtype.
+
     Parameters
     ----------
     img
@@ -258,11 +257,6 @@ def bin_spatial(
         ``"interleaved"``: pixel by pixel, ``cv2.resize(img, size).ravel()``, as in the lesson.
         ``"channels"``: one channel after the other, as in the HOG sub-sampling quiz and in the main API. A
         model trained on one order does not work on the other.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(width * height * 3,)``, or ``(width * height,)`` of one channel, of the image's dtype.
 
     Examples
     --------
@@ -293,6 +287,8 @@ def color_hist(
 ) -> NDArray[np.int64]:
     """Histogram of each channel, one after the other.
 
+    Returns ``(3 * nbins,)`` int64 counts.
+
     Parameters
     ----------
     img
@@ -302,11 +298,6 @@ def color_hist(
     bins_range
         Values that the bins cover. With the default, all values of a 0-1 image fall into the first bin: pass
         ``(0, 1)``. None takes each channel's own minimum and maximum, as the HOG sub-sampling quiz does.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(3 * nbins,)`` int64 counts.
 
     Examples
     --------

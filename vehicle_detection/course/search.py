@@ -85,6 +85,8 @@ def search_windows(
 ) -> list[Any]:
     """Classify each window of an image, resized to 64x64 pixels.
 
+    Returns the windows, in their order, for which the classifier predicts 1.
+
     Parameters
     ----------
     img
@@ -102,11 +104,6 @@ def search_windows(
         As in `extract_features`, of the features that the classifier was trained on.
     spatial_feat, hist_feat, hog_feat, transform_sqrt, spatial_order
         As in `extract_features`.
-
-    Returns
-    -------
-    list
-        The windows, in their order, for which the classifier predicts 1.
 
     Warns
     -----
@@ -180,10 +177,7 @@ def find_cars(
 ) -> Image:
     """Draw the windows of `find_car_windows` on a copy of the image; the arguments are the same.
 
-    Returns
-    -------
-    numpy.ndarray
-        A new image with blue rectangles, 6 pixels thick.
+    Returns a new image with blue rectangles, 6 pixels thick.
 
     Examples
     --------
@@ -229,6 +223,9 @@ def find_car_windows(
 ) -> list[Box]:
     """Search a band of an image at one scale, with one HOG for all windows: the boxes that `find_cars` draws.
 
+    Returns corner pairs ``((x1, y1), (x2, y2))`` of the windows for which the classifier predicts 1, column
+    by column, as in the quiz.
+
     Parameters
     ----------
     img
@@ -262,12 +259,6 @@ def find_car_windows(
         ``(blocks - blocks per window) // cells_per_step``, which leaves out the last position; ``"new"`` adds
         one. `set_lesson_defaults` does not change this default: the two versions of `slide_window` are
         independent of these.
-
-    Returns
-    -------
-    list
-        Corner pairs ``((x1, y1), (x2, y2))`` of the windows for which the classifier predicts 1, column by
-        column, as in the quiz.
 
     Warns
     -----

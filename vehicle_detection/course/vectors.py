@@ -174,6 +174,10 @@ def extract_features(
 ) -> list[NDArray[Any]]:
     """Feature vectors of a list of images.
 
+    Returns a 1-D vector for each image, ``[spatial | histogram | HOG]``: float32 for 64x64 uint8 images,
+    which the library's kernels compute, float64 for others. The lesson's code converts the stacked vectors to
+    float64 itself.
+
     Parameters
     ----------
     imgs
@@ -195,13 +199,6 @@ def extract_features(
         Function that reads a file as RGB. None reads like the lesson's ``mpimg.imread``: a PNG as float 0-1,
         other files as uint8. ``vehicle_detection.read_image`` reads every file as uint8, which is faster;
         search uint8 images then, and pass ``divide_by=1`` to `find_cars`.
-
-    Returns
-    -------
-    list of numpy.ndarray
-        A 1-D vector for each image, ``[spatial | histogram | HOG]``: float32 for 64x64 uint8 images, which
-        the library's kernels compute, float64 for others. The lesson's code converts the stacked vectors to
-        float64 itself.
 
     Examples
     --------

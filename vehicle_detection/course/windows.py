@@ -31,6 +31,8 @@ def slide_window(
 ) -> list[Box]:
     """List the windows of one size over a region of an image, row by row.
 
+    Returns corner pairs ``((x1, y1), (x2, y2))``.
+
     Parameters
     ----------
     img
@@ -46,11 +48,6 @@ def slide_window(
         with overlaps above 0.5 the last windows extend beyond the region, and below 0.5 some that fit are
         left out. ``"new"``: ``int((span - int(window * overlap)) / step)``, the windows that fit. None is the
         default of `set_lesson_defaults`, initially ``"old"``.
-
-    Returns
-    -------
-    list
-        Corner pairs ``((x1, y1), (x2, y2))``.
 
     Examples
     --------
@@ -151,17 +148,14 @@ def corner_array(boxes: Any, name: str) -> NDArray[np.int64]:
 def add_heat(heatmap: NDArray[Any], bbox_list: Any) -> NDArray[Any]:
     """Add 1 to the pixels of each box, in place: `add_heat` of the main API for corner pairs.
 
+    Returns the same array, `heatmap`.
+
     Parameters
     ----------
     heatmap
         ``(H, W)``; changed.
     bbox_list
         Corner pairs, an ``(N, 4)`` array, or `Detections`; parts outside the map are cut off.
-
-    Returns
-    -------
-    numpy.ndarray
-        The same array, `heatmap`.
 
     Examples
     --------
@@ -181,6 +175,8 @@ apply_threshold = library.apply_threshold
 def draw_boxes(img: Image, bboxes: Any, color: Sequence[float] = _BLUE, thick: int = _THICKNESS) -> Image:
     """Draw boxes on a copy of an image; the lines are centered on the box's edges, as by ``cv2.rectangle``.
 
+    Returns a new image of the same dtype.
+
     Parameters
     ----------
     img
@@ -191,11 +187,6 @@ def draw_boxes(img: Image, bboxes: Any, color: Sequence[float] = _BLUE, thick: i
         RGB, 0-255 each.
     thick
         Width of the lines in pixels; -1 fills the boxes.
-
-    Returns
-    -------
-    numpy.ndarray
-        A new image of the same dtype.
 
     Examples
     --------
@@ -217,18 +208,15 @@ def draw_boxes(img: Image, bboxes: Any, color: Sequence[float] = _BLUE, thick: i
 def draw_labeled_bboxes(img: Image, labels: Any) -> Image:
     """Draw the bounding box of each labeled region on the image itself.
 
+    Returns the same array, `img`, with blue rectangles, 6 pixels thick. Their corners are a region's first
+    and last pixels, so they are one pixel smaller than the half-open boxes of the main API.
+
     Parameters
     ----------
     img
         ``(H, W, 3)``, uint8 or float; changed.
     labels
         The label array ``(H, W)`` and the number of regions, as ``scipy.ndimage.label`` returns them.
-
-    Returns
-    -------
-    numpy.ndarray
-        The same array, `img`, with blue rectangles, 6 pixels thick. Their corners are a region's first and
-        last pixels, so they are one pixel smaller than the half-open boxes of the main API.
 
     Raises
     ------

@@ -257,6 +257,8 @@ def fetch_patches(
     non-vehicles) and written atomically. An existing archive that verifies is not downloaded again. The
     patches come from the GTI vehicle image database and KITTI (CC BY-NC-SA 3.0, non-commercial).
 
+    Returns paths of the vehicles and the non-vehicles, the arguments of `load_training_patches`.
+
     Parameters
     ----------
     folder, url
@@ -264,11 +266,6 @@ def fetch_patches(
         (``http://`` or ``https://``) that they are at.
     progress
         Show a progress bar on standard error.
-
-    Returns
-    -------
-    tuple of pathlib.Path
-        Paths of the vehicles and the non-vehicles, the arguments of `load_training_patches`.
 
     Raises
     ------

@@ -44,15 +44,12 @@ class FrameSet:
 def load_frames(folder: str | os.PathLike[str]) -> FrameSet:
     """List the frames (PNG, JPEG) in a folder; `read_labels` reads their boxes.
 
+    ``frames.names[i]`` is the file name that labels refer to; ``frames[i]`` reads the image.
+
     Parameters
     ----------
     folder
         The folder; its subfolders are not searched.
-
-    Returns
-    -------
-    FrameSet
-        ``frames.names[i]`` is the file name that labels refer to; ``frames[i]`` reads the image.
 
     Raises
     ------

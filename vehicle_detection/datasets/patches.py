@@ -171,6 +171,8 @@ def load_patches(
     The order is natural (``image2`` before ``image10``) and the same for a zip and the folder it unpacks to.
     Hidden files and macOS resource files are skipped.
 
+    Returns patches with their labels and names.
+
     Parameters
     ----------
     source
@@ -181,11 +183,6 @@ def load_patches(
     size, n_jobs, progress
         Side in pixels that every patch must have; threads, None for one per core, at most 8; and whether to
         show a progress bar on standard error.
-
-    Returns
-    -------
-    PatchSet
-        Patches with their labels and names.
 
     Raises
     ------
@@ -221,15 +218,12 @@ def load_training_patches(
 ) -> PatchSet:
     """Read both classes into one set, vehicles first; the arguments are what `fetch_patches` returns.
 
+    Returns patches of 64x64 pixels, in natural order in each class.
+
     Parameters
     ----------
     vehicles, non_vehicles, n_jobs, progress
         A folder or zip file for each class; the others as in `load_patches`.
-
-    Returns
-    -------
-    PatchSet
-        Patches of 64x64 pixels, in natural order in each class.
 
     Raises
     ------

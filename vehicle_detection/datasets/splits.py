@@ -73,11 +73,6 @@ def split_random(
     test_size, random_state
         Fraction of test patches, in (0, 1), rounded up to whole patches; and the seed.
 
-    Returns
-    -------
-    Split
-        All rows.
-
     Raises
     ------
     InvalidInputError
@@ -119,11 +114,6 @@ def split_sequences(patch_set: PatchSet, *, test_size: float = 0.2) -> Split:
     test_size
         Fraction of each folder to test on, in (0, 1), rounded. A folder of two or more patches gives at least
         one to each part; a single patch goes to the training part.
-
-    Returns
-    -------
-    Split
-        All rows.
 
     Raises
     ------
@@ -171,11 +161,6 @@ def split_groups(
         As in `find_near_duplicates`, and the seed. On the course's vehicles, most pairs at 0.9 show the same
         car; at 0.85 a quarter of all patches fall into one group by chance.
 
-    Returns
-    -------
-    Split
-        All rows.
-
     Raises
     ------
     InvalidInputError
@@ -222,16 +207,13 @@ def split_sources(
     The default trains on GTI, and tests on the vehicles of KITTI and the non-vehicles of Extras. The reverse
     is ``train=("KITTI", "Extras"), test=("GTI",)``.
 
+    Returns the rows of the named sources.
+
     Parameters
     ----------
     patch_set, train, test
         The patches, and prefixes of the sources of each part: ``"GTI"`` selects ``GTI``, ``GTI_Far`` and so
         on. Other sources are left out.
-
-    Returns
-    -------
-    Split
-        The rows of the named sources.
 
     Examples
     --------
@@ -287,16 +269,14 @@ def find_near_duplicates(
     Patches are compared by the correlation of their 16x16 gray thumbnails, which ignores brightness and
     contrast. A uniform patch has no near duplicate. Labels are ignored.
 
+    Returns ``(M, 2)`` row numbers: each patch that has a near duplicate, ascending, and the most similar
+    patch.
+
     Parameters
     ----------
     patches, threshold
         A `PatchSet`, or ``(N, 64, 64, 3)`` uint8 RGB; and the smallest correlation of near duplicates, in
         (0, 1].
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(M, 2)`` row numbers: each patch that has a near duplicate, ascending, and the most similar patch.
 
     Examples
     --------
@@ -360,15 +340,12 @@ def group_near_duplicates(thumbnails: NDArray[np.float32], limit: float) -> NDAr
 def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95) -> float:
     """Fraction of test patches that have a near duplicate among the training patches.
 
+    Returns a fraction in [0, 1]; 0 for a split by `split_groups` at this threshold or a lower one.
+
     Parameters
     ----------
     patch_set, split, threshold
         The patches, a split of them, and the threshold of `find_near_duplicates`.
-
-    Returns
-    -------
-    float
-        In [0, 1]; 0 for a split by `split_groups` at this threshold or a lower one.
 
     Examples
     --------

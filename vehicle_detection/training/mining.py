@@ -40,6 +40,10 @@ def mine_negatives(
     vehicle in the frames must therefore be labelled, at least coarsely. Do not evaluate on mined frames. The
     detector is then trained again with its false positives (Dalal and Triggs, CVPR 2005, section 4).
 
+    Returns non-vehicles, 64x64 pixels, frame by frame, highest score first, with the names
+    ``non-vehicles/<source>/<frame>_<x1>_<y1>_<side>.png``; may be empty. `PatchSet.concatenate` appends them
+    to the training patches.
+
     Parameters
     ----------
     frames, labels
@@ -55,13 +59,6 @@ def mine_negatives(
         this number of patches with the highest scores is kept; None keeps all.
     source
         Source folder in the names of the patches.
-
-    Returns
-    -------
-    PatchSet
-        Non-vehicles, 64x64 pixels, frame by frame, highest score first, with the names
-        ``non-vehicles/<source>/<frame>_<x1>_<y1>_<side>.png``; may be empty. `PatchSet.concatenate` appends
-        them to the training patches.
 
     Examples
     --------

@@ -66,16 +66,13 @@ def numeric_column(table: DataFrame, name: str) -> NDArray[np.float64]:
 def pareto_front(table: DataFrame, quality: str = "accuracy", cost: str = "search_ms") -> DataFrame:
     """Select the rows that no other row beats in quality or cost without being worse in the other.
 
+    Returns the selected rows, cheapest first, with their index.
+
     Parameters
     ----------
     table, quality, cost
         Results, such as those of `compare_configurations`, and numeric columns: a higher quality and a lower
         cost are better. Rows without either value are left out. Of equal rows the first one is kept.
-
-    Returns
-    -------
-    pandas.DataFrame
-        The selected rows, cheapest first, with their index.
 
     Examples
     --------
@@ -112,16 +109,13 @@ def write_results(table: DataFrame, path: str | os.PathLike[str]) -> None:
 def read_results(path: str | os.PathLike[str]) -> DataFrame:
     """Read the table of a finished or interrupted run: the ``store`` of a search, or a written table.
 
+    Returns one row per line; see `compare_configurations` for the columns. NaN marks a missing value.
+
     Parameters
     ----------
     path
         A ``.csv`` or ``.jsonl`` file. An incomplete last line is left out, and so is the second row of a
         trial that two runs have measured at the same time.
-
-    Returns
-    -------
-    pandas.DataFrame
-        One row per line; see `compare_configurations` for the columns. NaN marks a missing value.
 
     Raises
     ------

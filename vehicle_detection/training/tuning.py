@@ -66,6 +66,20 @@ def compare_configurations(
 ) -> DataFrame:
     """Train and evaluate every configuration with every C on every split.
 
+    Returns one row per trial, with NaN for missing values:
+
+    - ``status``: ``"ok"``; ``"partial"`` if the fast search does not support the features, so that
+      neither frames nor speed are measured; ``"failed"`` if the combination is impossible.
+      ``message`` gives the reason.
+    - ``stage`` (``"compare"``), ``configuration`` (its name), the fields of `FeatureParams`,
+      ``n_features``, ``C``, ``mirror``, ``positive_weight``, ``split`` and ``seed``.
+    - ``train_size`` and ``test_size``, in patches; ``train_accuracy`` and ``accuracy``, fractions.
+    - ``frame_f1`` (at the detector's thresholds), ``frame_best_f1`` (at the best score threshold),
+      ``frame_average_precision`` and ``frame_iou``: means over the sets of frames;
+      ``frame_f1_by_set``: text.
+    - ``search_ms`` of the fast search of one frame and ``fit_seconds`` of the training.
+    - ``trial``: a hash of patches, configuration, split, seed, and the frames' names and labels.
+
     Parameters
     ----------
     patch_set, configurations
@@ -84,23 +98,6 @@ def compare_configurations(
     store
         A ``.csv`` or ``.jsonl`` file to which each row is appended as soon as it is measured. Rows that it
         already holds are not measured again; an incomplete last line is dropped.
-
-    Returns
-    -------
-    pandas.DataFrame
-        One row per trial, with NaN for missing values:
-
-        - ``status``: ``"ok"``; ``"partial"`` if the fast search does not support the features, so that
-          neither frames nor speed are measured; ``"failed"`` if the combination is impossible.
-          ``message`` gives the reason.
-        - ``stage`` (``"compare"``), ``configuration`` (its name), the fields of `FeatureParams`,
-          ``n_features``, ``C``, ``mirror``, ``positive_weight``, ``split`` and ``seed``.
-        - ``train_size`` and ``test_size``, in patches; ``train_accuracy`` and ``accuracy``, fractions.
-        - ``frame_f1`` (at the detector's thresholds), ``frame_best_f1`` (at the best score threshold),
-          ``frame_average_precision`` and ``frame_iou``: means over the sets of frames;
-          ``frame_f1_by_set``: text.
-        - ``search_ms`` of the fast search of one frame and ``fit_seconds`` of the training.
-        - ``trial``: a hash of patches, configuration, split, seed, and the frames' names and labels.
 
     Raises
     ------
