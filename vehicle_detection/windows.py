@@ -30,56 +30,6 @@ from vehicle_detection.svm import CLASSIFIER_REMEDY, VehicleClassifier
 Range = Sequence[int | None]
 
 
-class WindowArray(np.ndarray[Any, np.dtype[np.int64]]):
-    """``(N, 4)`` windows whose ``+`` joins lists of windows, as the course's code expects.
-
-    Adding a number or one row of four numbers shifts the windows, as in NumPy; ``numpy.add`` always adds.
-    Everything else is an ordinary array, and results of arithmetic are ordinary arrays.
-
-    Examples
-    --------
-    >>> image = np.zeros((64, 128, 3), np.uint8)
-    >>> windows = slide_window(image) + slide_window(image, xy_window=(32, 32))
-    >>> len(windows), windows[0].tolist(), (windows + 5)[0].tolist()
-    (24, [0, 0, 64, 64], [5, 5, 69, 69])
-    """
-
-    def __array_finalize__(self, obj: object) -> None:
-        """Nothing to inherit."""
-
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, out: Any = None, **options: Any) -> Any:
-        """Compute with plain arrays."""
-        if out is not None:
-            options["out"] = tuple(map(_plain, out))
-        result = getattr(ufunc, method)(*map(_plain, inputs), **options)
-        return out[0] if out is not None and len(out) == 1 else result
-
-    def __add__(self, other: Any) -> Any:
-        return self._join(self, other) if self._is_list(other) else super().__add__(other)
-
-    def __radd__(self, other: Any) -> Any:
-        return self._join(other, self) if self._is_list(other) else super().__radd__(other)
-
-    def __iadd__(self, other: Any) -> Any:
-        return self + other if self._is_list(other) else super().__iadd__(other)
-
-    def _is_list(self, other: Any) -> bool:
-        """Whether both sides are lists of windows; corner pairs count as windows."""
-        if self.ndim != 2 or self.shape[1] != 4 or not isinstance(other, (np.ndarray, list, tuple)):
-            return False
-        return np.shape(other)[1:] in ((4,), (2, 2)) or np.shape(other) == (0,)
-
-    @staticmethod
-    def _join(first: Any, second: Any) -> WindowArray:
-        parts = [np.asarray(part).reshape(-1, 4) for part in (first, second) if len(part)]
-        joined = check_boxes(np.concatenate(parts) if parts else np.empty((0, 4), np.int64), "windows")
-        return joined.view(WindowArray)
-
-
-def _plain(value: Any) -> Any:
-    return value.view(np.ndarray) if isinstance(value, WindowArray) else value
-
-
 def slide_window(
     image: NDArray[np.uint8],
     *,
@@ -87,7 +37,7 @@ def slide_window(
     y_start_stop: Range = (None, None),
     xy_window: Sequence[int] = (64, 64),
     xy_overlap: Sequence[float] = (0.5, 0.5),
-) -> WindowArray:
+) -> NDArray[np.int64]:
     """List the windows of one size over a region of the image.
 
     Returns ``(N, 4)`` int64 ``[x1, y1, x2, y2]``, row by row: every window of the grid that fits into the
@@ -122,7 +72,7 @@ def slide_window(
         # The step is truncated as in the course; the small term compensates rounding, as in 50 * (1 - 0.9).
         steps.append(max(1, int(side * (1 - overlap) + 1e-9)))
     band = PixelBand(x1, y1, x2, y2, (int(xy_window[0]), int(xy_window[1])), (steps[0], steps[1]))
-    return band_windows(band).view(WindowArray)
+    return band_windows(band)
 
 
 def band_windows(band: PixelBand) -> NDArray[np.int64]:
