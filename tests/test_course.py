@@ -21,7 +21,7 @@ from sklearn.tree import DecisionTreeClassifier
 import vehicle_detection.course as lesson
 from tests import lesson_reference as reference
 from vehicle_detection import Detections, read_image, write_image
-from vehicle_detection.course import search
+from vehicle_detection.course import search as search_module
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes import render_patches, render_scene
 
@@ -437,7 +437,7 @@ def test_the_fast_search_has_the_hits_of_the_lesson(models):
 
 def test_the_fast_search_is_used_where_it_applies(models, monkeypatch):
     case = models["all", "uint8"]
-    monkeypatch.setattr(search._Estimators, "predict", None)
+    monkeypatch.setattr(search_module._Estimators, "predict", None)
     lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, *case.model, 9, 8, 2, (16, 16), 16, divide_by=1)
     lesson.search_windows(FRAMES["uint8"], PAIRS, *case.model, **case.options)
 
@@ -453,7 +453,7 @@ def test_a_grid_search_uses_the_fast_search_too(models, monkeypatch):
         for clf in (grid, grid.best_estimator_)
     ]
     assert hits[0] == hits[1] != []
-    monkeypatch.setattr(search._Estimators, "predict", None)
+    monkeypatch.setattr(search_module._Estimators, "predict", None)
     lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, grid, scaler, *arguments, divide_by=1)
     lesson.search_windows(FRAMES["uint8"], PAIRS, grid, scaler, **case.options)
 
@@ -568,7 +568,7 @@ def test_old_estimators_take_the_fast_search(models, monkeypatch):
     """``n_features_in_`` was added in scikit-learn 0.24."""
     svc, scaler = copy.deepcopy(models["all", "uint8"].model)
     del svc.n_features_in_, scaler.n_features_in_
-    monkeypatch.setattr(search._Estimators, "predict", None)
+    monkeypatch.setattr(search_module._Estimators, "predict", None)
     lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, svc, scaler, 9, 8, 2, (16, 16), 16, divide_by=1)
     with pytest.raises(InvalidInputError, match="fitted on 6108 features, but these options give 8460"):
         lesson.find_cars(FRAMES["uint8"], 60, 200, 1, svc, scaler, 9, 8, 2, (32, 32), 32, divide_by=1)
