@@ -111,7 +111,14 @@ def _add(step, row, center, squares, weights):
 
 @jit
 def _descend(features, rows, signs, ridge, center, squares, weights, tolerance, max_sweeps, rng):
-    """Solve the dual problem: update `weights`, those of centered rows, in place and return the intercept."""
+    """Solve the dual problem: update `weights`, those of centered rows, in place and return the intercept.
+
+    With the score ``f = x @ w + b``, the primal problem is the minimum of ``(|w|^2 + b^2) / 2`` plus the sum
+    of ``C_i max(0, 1 - y_i f_i)^2`` over the rows. Its dual has a multiplier ``a_i >= 0`` for each row, with
+    ``w = sum(a_i y_i x_i)`` and ``b = sum(a_i y_i)``. Its derivative by ``a_i`` is
+    ``y_i f_i - 1 + ridge_i a_i`` with ``ridge_i = 1 / (2 C_i)``, and its second derivative
+    ``|x_i|^2 + 1 + ridge_i``. A sweep takes one Newton step for each multiplier, in random order.
+    """
     count = rows.shape[0]
     curvature = np.empty(count)
     for index in range(count):
@@ -122,7 +129,7 @@ def _descend(features, rows, signs, ridge, center, squares, weights, tolerance, 
     bound = np.inf
     for _ in range(max_sweeps):
         highest, lowest = -np.inf, np.inf
-        for position in range(active - 1):
+        for position in range(active - 1):  # shuffle the active rows
             other = position + int(rng.random() * (active - position))
             order[position], order[other] = order[other], order[position]
         position = 0
@@ -131,6 +138,7 @@ def _descend(features, rows, signs, ridge, center, squares, weights, tolerance, 
             row = features[rows[index]]
             score = _score(row, center, weights) + intercept
             slope = signs[index] * score - 1.0 + ridge[index] * multipliers[index]
+            # At the bound 0, only a negative slope can improve.
             if multipliers[index] == 0.0:
                 if slope > bound:
                     # Shrinking: skip this row until the others have converged.
@@ -149,6 +157,7 @@ def _descend(features, rows, signs, ridge, center, squares, weights, tolerance, 
         if highest - lowest <= tolerance:
             if active == count:
                 break
+            # The active rows have converged: check the skipped ones as well.
             active, bound = count, np.inf
         else:
             bound = highest if highest > 0 else np.inf
