@@ -26,7 +26,6 @@ from vehicle_detection.training import (
     train_and_evaluate,
     train_classifier,
 )
-from vehicle_detection.training.patches import _error_rates
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=6, pix_per_cell=16, hog_channel=0)
 SOURCES = {True: ("GTI_Far", "KITTI_extracted"), False: ("GTI", "Extras")}
@@ -93,11 +92,6 @@ def test_the_scores_equal_training_on_the_training_part_only(patch_set, mirror, 
             assert alone.score(patch_set.patches[test], patch_set.labels[test]) == accuracy
         assert score.leakage == split_leakage(patch_set, each[0])
         assert (score.train, score.test) == (len(each[0].train), len(each[0].test))
-
-
-def test_error_rates():
-    predicted, labels = np.array([1, 0, 0, 1, 0, 1]), np.array([1, 1, 1, 0, 0, 0])
-    assert _error_rates(predicted, labels) == pytest.approx((1 / 3, 2 / 3, 2 / 3))
 
 
 def test_the_model_is_trained_on_all_patches(trained, patch_set):

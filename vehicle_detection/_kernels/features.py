@@ -65,87 +65,24 @@ def hog_cells(image, channels, cell, cotangents, cells):
     arctangent, and is equal for opposite gradients. The quotients of integers up to 255 are too far from the
     cotangents for rounding to matter. Sums are cumulative over the bounds and differenced at the end.
     """
-    height, width = image.shape
     orient, rows, columns = cells.shape[1], cells.shape[2], cells.shape[3]
-    per_tile = max(1, _TILE // (cell * channels))
     span = cell * channels
+    per_tile = max(1, _TILE // span)
     size = per_tile * span
-    quotient = np.empty(size, np.float32)
-    magnitude = np.empty(size, np.float32)
+    quotient, magnitude = np.empty(size, np.float32), np.empty(size, np.float32)
     fours, eights = np.empty(size, np.float32), np.empty(size, np.float32)
     reduced = np.empty((orient, channels, per_tile), np.float32)
     sums = np.empty((orient, size), np.float32)
     scale = np.float32(1.0 / (cell * cell))
-    zero = np.float32(0)
-    infinite = np.float32(np.inf)
     for row in range(rows):
         for first in range(0, columns, per_tile):
             count = min(per_tile, columns - first)
-            start = first * span
-            n = count * span
-            sums.fill(zero)
+            start, n = first * span, count * span
+            sums.fill(np.float32(0))
             for y in range(row * cell, (row + 1) * cell):
-                # The gradient at the array's border is zero.
-                low = channels if start == 0 else 0
-                high = n - channels if start + n == width else n
-                inside = 0 < y < height - 1
-                above = image[y - 1 if inside else y, start : start + n]
-                below = image[y + 1 if inside else y, start : start + n]
-                left = image[y, start + low - channels : start + high - channels]
-                right = image[y, start + low + channels : start + high + channels]
-                quotient[:low] = zero
-                quotient[high:n] = zero
-                inner = quotient[low:high]
-                for i in range(high - low):
-                    inner[i] = np.float32(right[i]) - np.float32(left[i])
-                for i in range(n):
-                    gx = quotient[i]
-                    gy = np.float32(below[i]) - np.float32(above[i])
-                    magnitude[i] = np.sqrt(gx * gx + gy * gy)
-                    # A horizontal gradient has angle 0, for either sign.
-                    quotient[i] = gx / gy if gy != zero else infinite
-                total = sums[0]
-                for i in range(n):
-                    total[i] += magnitude[i]
-                # Four bounds at a time: each loaded quotient is compared four times.
-                single = 1 + (orient - 1) // 4 * 4
-                for k in range(1, single, 4):
-                    c0, c1 = cotangents[k], cotangents[k + 1]
-                    c2, c3 = cotangents[k + 2], cotangents[k + 3]
-                    t0, t1, t2, t3 = sums[k], sums[k + 1], sums[k + 2], sums[k + 3]
-                    for i in range(n):
-                        q, m = quotient[i], magnitude[i]
-                        t0[i] += m if q <= c0 else zero
-                        t1[i] += m if q <= c1 else zero
-                        t2[i] += m if q <= c2 else zero
-                        t3[i] += m if q <= c3 else zero
-                for k in range(single, orient):
-                    c0, t0 = cotangents[k], sums[k]
-                    for i in range(n):
-                        t0[i] += magnitude[i] if quotient[i] <= c0 else zero
-            # Sums over a cell's columns: of four and eight columns at every position, of which one in `span`
-            # is used.
-            ahead = n - 3 * channels
-            for k in range(orient):
-                total = sums[k]
-                single, step = total, 1
-                if cell % 4 == 0:
-                    s1, s2, s3 = total[channels:], total[2 * channels :], total[3 * channels :]
-                    for i in range(ahead):
-                        fours[i] = (total[i] + s1[i]) + (s2[i] + s3[i])
-                    single, step = fours, 4
-                    if cell % 8 == 0:
-                        other = fours[4 * channels :]
-                        for i in range(ahead - 4 * channels):
-                            eights[i] = fours[i] + other[i]
-                        single, step = eights, 8
-                for channel in range(channels):
-                    for column in range(count):
-                        at = column * span + channel
-                        value = single[at]
-                        for x in range(step, cell, step):
-                            value += single[at + x * channels]
-                        reduced[k, channel, column] = value
+                _row_gradients(image, channels, y, start, n, quotient, magnitude)
+                _add_beyond_bounds(quotient, magnitude, cotangents, n, sums)
+            _sum_columns(sums, cell, channels, count, fours, eights, reduced)
             for channel in range(channels):
                 for k in range(orient):
                     out, within = cells[channel, k, row, first : first + count], reduced[k, channel]
@@ -156,6 +93,88 @@ def hog_cells(image, channels, cell, cotangents, cells):
                     else:
                         for column in range(count):
                             out[column] = within[column] * scale
+
+
+@jit
+def _row_gradients(image, channels, y, start, n, quotient, magnitude):
+    """Write ``gx / gy`` and the magnitude of the gradients of `n` values of row `y`, from `start`."""
+    height, width = image.shape
+    zero, infinite = np.float32(0), np.float32(np.inf)
+    # The gradient at the array's border is zero.
+    low = channels if start == 0 else 0
+    high = n - channels if start + n == width else n
+    inside = 0 < y < height - 1
+    above = image[y - 1 if inside else y, start : start + n]
+    below = image[y + 1 if inside else y, start : start + n]
+    left = image[y, start + low - channels : start + high - channels]
+    right = image[y, start + low + channels : start + high + channels]
+    quotient[:low] = zero
+    quotient[high:n] = zero
+    inner = quotient[low:high]
+    for i in range(high - low):
+        inner[i] = np.float32(right[i]) - np.float32(left[i])
+    for i in range(n):
+        gx = quotient[i]
+        gy = np.float32(below[i]) - np.float32(above[i])
+        magnitude[i] = np.sqrt(gx * gx + gy * gy)
+        # A horizontal gradient has angle 0, for either sign.
+        quotient[i] = gx / gy if gy != zero else infinite
+
+
+@jit
+def _add_beyond_bounds(quotient, magnitude, cotangents, n, sums):
+    """Add each magnitude to ``sums[k]`` for every bound `k` that its angle is beyond."""
+    orient, zero = len(cotangents), np.float32(0)
+    total = sums[0]
+    for i in range(n):
+        total[i] += magnitude[i]
+    # Four bounds at a time: each loaded quotient is compared four times.
+    single = 1 + (orient - 1) // 4 * 4
+    for k in range(1, single, 4):
+        c0, c1 = cotangents[k], cotangents[k + 1]
+        c2, c3 = cotangents[k + 2], cotangents[k + 3]
+        t0, t1, t2, t3 = sums[k], sums[k + 1], sums[k + 2], sums[k + 3]
+        for i in range(n):
+            q, m = quotient[i], magnitude[i]
+            t0[i] += m if q <= c0 else zero
+            t1[i] += m if q <= c1 else zero
+            t2[i] += m if q <= c2 else zero
+            t3[i] += m if q <= c3 else zero
+    for k in range(single, orient):
+        c0, t0 = cotangents[k], sums[k]
+        for i in range(n):
+            t0[i] += magnitude[i] if quotient[i] <= c0 else zero
+
+
+@jit
+def _sum_columns(sums, cell, channels, count, fours, eights, reduced):
+    """Sum the columns of `count` cells: ``reduced[k, channel, column]`` from rows of sums ``(orient, n)``.
+
+    First the sums of four and of eight columns at every position, of which one for each cell is used:
+    adjacent values, unlike the columns of a cell, are added as vectors.
+    """
+    span = cell * channels
+    ahead = (count * cell - 3) * channels
+    for k in range(len(sums)):
+        total = sums[k]
+        single, step = total, 1
+        if cell % 4 == 0:
+            s1, s2, s3 = total[channels:], total[2 * channels :], total[3 * channels :]
+            for i in range(ahead):
+                fours[i] = (total[i] + s1[i]) + (s2[i] + s3[i])
+            single, step = fours, 4
+            if cell % 8 == 0:
+                other = fours[4 * channels :]
+                for i in range(ahead - 4 * channels):
+                    eights[i] = fours[i] + other[i]
+                single, step = eights, 8
+        for channel in range(channels):
+            for column in range(count):
+                at = column * span + channel
+                value = single[at]
+                for x in range(step, cell, step):
+                    value += single[at + x * channels]
+                reduced[k, channel, column] = value
 
 
 @jit
@@ -426,16 +445,10 @@ def add_root_histograms(image, bin_of_value, weights, cell, window, scores):
     counts = np.empty((3 * bins, columns), np.uint16)
     flat = counts.reshape(-1)
     # Start of each bin's counts. Unsigned indices avoid the check for negative ones.
-    first, second, third = (
-        np.empty(256, np.uintp),
-        np.empty(256, np.uintp),
-        np.empty(256, np.uintp),
-    )
-    for value in range(256):
-        first[value] = bin_of_value[value] * columns
-        second[value] = first[value] + np.uintp(bins * columns)
-        third[value] = second[value] + np.uintp(bins * columns)
-    one = np.uint16(1)
+    starts = np.empty((3, 256), np.uintp)
+    for channel in range(3):
+        for value in range(256):
+            starts[channel, value] = (channel * bins + bin_of_value[value]) * columns
     wide = np.empty(columns, np.uint16)
     recent = np.zeros((window, 3 * bins, width), np.uint16)
     filled = np.zeros((window, 3 * bins), np.bool_)
@@ -445,13 +458,7 @@ def add_root_histograms(image, bin_of_value, weights, cell, window, scores):
     for row in range(rows):
         counts.fill(np.uint16(0))
         for y in range(row * cell, (row + 1) * cell):
-            line = image[y]
-            for column in range(columns):
-                offset = np.uintp(column)
-                for x in range(column * cell, (column + 1) * cell):
-                    flat[first[line[x, 0]] + offset] += one
-                    flat[second[line[x, 1]] + offset] += one
-                    flat[third[line[x, 2]] + offset] += one
+            _count_by_bin(image[y], starts, cell, columns, flat)
         slot = row % window
         for k in range(3 * bins):
             count = counts[k]
@@ -464,16 +471,7 @@ def add_root_histograms(image, bin_of_value, weights, cell, window, scores):
                     total[x] -= last[x]
             filled[slot, k] = any_count > 0
             if any_count > 0:
-                # Sums of two cells, of four, of eight, up to the width of a window.
-                span = 1
-                while span < window:
-                    reach = columns - span
-                    left, right = count[:reach], count[span:]
-                    for x in range(reach):
-                        wide[x] = left[x] + right[x]
-                    for x in range(reach):
-                        left[x] = wide[x]
-                    span *= 2
+                _sum_windows(count, window, wide)
                 for x in range(width):
                     last[x] = count[x]
                     total[x] += count[x]
@@ -488,6 +486,33 @@ def add_root_histograms(image, bin_of_value, weights, cell, window, scores):
                     out = scores[template, row - window + 1]
                     for x in range(width):
                         out[x] += weight * roots[x]
+
+
+@jit
+def _count_by_bin(line, starts, cell, columns, counts):
+    """Count the values of a row of pixels ``(W, 3)`` by bin and cell; `counts` holds bin after bin."""
+    first, second, third = starts[0], starts[1], starts[2]
+    one = np.uint16(1)
+    for column in range(columns):
+        offset = np.uintp(column)
+        for x in range(column * cell, (column + 1) * cell):
+            counts[first[line[x, 0]] + offset] += one
+            counts[second[line[x, 1]] + offset] += one
+            counts[third[line[x, 2]] + offset] += one
+
+
+@jit
+def _sum_windows(count, window, wide):
+    """Sum the counts of `window` cells from each cell on, in place: of two cells, of four and so on."""
+    span = 1
+    while span < window:
+        reach = len(count) - span
+        left, right = count[:reach], count[span:]
+        for x in range(reach):
+            wide[x] = left[x] + right[x]
+        for x in range(reach):
+            left[x] = wide[x]
+        span *= 2
 
 
 @jit

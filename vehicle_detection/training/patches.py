@@ -207,19 +207,8 @@ def train_and_evaluate(
             for name, listed in splits.items():
                 with step("leakage", fits=0):
                     leakage = split_leakage(patch_set, listed[0])
-                rates = [
-                    _error_rates(future.result() > 0, labels[parts.test])
-                    for future, parts in zip(running[name], listed)
-                ]
-                accuracies, false_negative_rates, false_positive_rates = zip(*rates)
-                scores[name] = SplitScore(
-                    accuracies=accuracies,
-                    false_negative_rate=float(np.mean(false_negative_rates)),
-                    false_positive_rate=float(np.mean(false_positive_rates)),
-                    train=len(listed[0].train),
-                    test=len(listed[0].test),
-                    leakage=leakage,
-                )
+                found = [future.result() for future in running[name]]
+                scores[name] = _score_split(listed, found, labels, leakage)
             error = None
             if calibration is not None and inner is not None:
                 platt = calibrate_scores(calibration.result(), labels[inner.test])
@@ -282,11 +271,20 @@ def _inner_split(patch_set: PatchSet, split: Split) -> Split | None:
     return inner if _has_both_classes(patch_set, inner) else None
 
 
-def _error_rates(predicted: NDArray[Any], labels: NDArray[np.int64]) -> tuple[float, float, float]:
-    """Accuracy, false negative rate and false positive rate."""
-    wrong = predicted != labels
-    vehicle = labels == 1
-    return float(1 - wrong.mean()), float(wrong[vehicle].mean()), float(wrong[~vehicle].mean())
+def _score_split(
+    splits: list[Split], found: list[NDArray[np.float64]], labels: NDArray[np.int64], leakage: float
+) -> SplitScore:
+    """Error rates on the test parts of the splits of one name; `found` are the scores of their patches."""
+    tested = [labels[parts.test] for parts in splits]
+    wrong = [(scores > 0) != truth for scores, truth in zip(found, tested)]
+    return SplitScore(
+        accuracies=tuple(float(1 - each.mean()) for each in wrong),
+        false_negative_rate=float(np.mean([each[truth == 1].mean() for each, truth in zip(wrong, tested)])),
+        false_positive_rate=float(np.mean([each[truth == 0].mean() for each, truth in zip(wrong, tested)])),
+        train=len(splits[0].train),
+        test=len(splits[0].test),
+        leakage=leakage,
+    )
 
 
 def _report_metadata(report: TrainingReport) -> dict[str, Any]:
