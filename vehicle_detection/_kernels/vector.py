@@ -80,97 +80,115 @@ def block_adder(block: Block) -> Callable[..., None]:
     ) -> Any:
         size = types.intp
         signature = types.void(weights, size, size, cells, size, size, size, sums, size, size)
-        lanes, vectors, rows = block
-        vector = ir.VectorType(ir.FloatType(), lanes)
-
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            left, right, out = (
-                context.make_array(signature.args[number])(context, builder, arguments[number])
-                for number in (0, 3, 7)
-            )
-            _, first, last, _, start, stride, step, _, position, row_step = arguments
-            depth = cgutils.unpack_tuple(builder, left.shape)[1]
-
-            def constant(value: int) -> Any:
-                return context.get_constant(types.intp, value)
-
-            def address(array: Any, place: Any, kind: Any) -> Any:
-                return builder.bitcast(builder.gep(array.data, [place]), kind.as_pointer())
-
-            def load(array: Any, place: Any, kind: Any) -> Any:
-                value = builder.load(address(array, place, kind))
-                value.align = 4
-                return value
-
-            def places(place: Any) -> list[Any]:
-                return [builder.add(place, constant(lanes * part)) for part in range(vectors)]
-
-            def grid_of(function: Callable[[int, int], Any]) -> list[list[Any]]:
-                return [[function(row, part) for part in range(vectors)] for row in range(rows)]
-
-            def connect(phis: Any, block: Any, values: Any) -> None:
-                for phi, value in zip(phis, values, strict=True):
-                    phi.add_incoming(value, block)
-
-            # Two loops, over `k` and over the channels `c`. Their counters and sums are phi nodes: these stay
-            # in registers.
-            entry = builder.block
-            outer, inner, latch, done = (
-                builder.append_basic_block(name) for name in ("cells", "channels", "next", "sums")
-            )
-            factor_step = builder.mul(depth, constant(rows))
-            origin = first, builder.mul(first, factor_step), start
-            builder.branch(outer)
-
-            builder.position_at_end(outer)
-            counters = [builder.phi(depth.type) for _ in range(3)]
-            totals = grid_of(lambda row, part: builder.phi(vector))
-            builder.branch(inner)
-
-            builder.position_at_end(inner)
-            channel, factor_place, place = inner_counters = [builder.phi(depth.type) for _ in range(3)]
-            parts = grid_of(lambda row, part: builder.phi(vector))
-            values = [load(right, each, vector) for each in places(place)]
-            numbers = [
-                load(left, builder.add(factor_place, constant(row)), vector.element) for row in range(rows)
-            ]
-            factors = [_broadcast(builder, number, vector) for number in numbers]
-            name = f"llvm.fmuladd.v{lanes}f32"
-            added = grid_of(
-                lambda row, part: _call(builder, name, factors[row], values[part], parts[row][part])
-            )
-            following = builder.add(channel, constant(1))
-            connect(inner_counters, outer, [constant(0), *counters[1:]])
-            moved = builder.add(factor_place, constant(rows)), builder.add(place, stride)
-            connect(inner_counters, inner, [following, *moved])
-            for line, known, new in zip(parts, totals, added):
-                connect(line, outer, known)
-                connect(line, inner, new)
-            builder.cbranch(builder.icmp_signed("<", following, depth), inner, latch)
-
-            builder.position_at_end(latch)
-            following = builder.add(counters[0], constant(1))
-            moved = builder.add(counters[1], factor_step), builder.add(counters[2], step)
-            connect(counters, entry, origin)
-            connect(counters, latch, [following, *moved])
-            for line, new in zip(totals, added):
-                connect(line, entry, [ir.Constant(vector, [0] * lanes)] * vectors)
-                connect(line, latch, new)
-            builder.cbranch(builder.icmp_signed("<", following, last), outer, done)
-
-            builder.position_at_end(done)
-            for line in added:
-                for each, total in zip(places(position), line):
-                    stored = builder.store(
-                        builder.fadd(load(out, each, vector), total), address(out, each, vector)
-                    )
-                    stored.align = 4
-                position = builder.sub(position, row_step)
-            return context.get_dummy_value()
-
-        return signature, generate
+        return signature, lambda context, builder, _, arguments: _generate(
+            block, context, builder, signature, arguments
+        )
 
     return add_products  # type: ignore[no-any-return]
+
+
+def _generate(block: Block, context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """Generate the code of `add_products`: two loops, over `k` and over the channels `c`.
+
+    Their counters and sums are phi nodes, one for each variable that a loop changes: these stay in registers.
+    """
+    lanes, vectors, rows = block
+    vector = ir.VectorType(ir.FloatType(), lanes)
+    left, right, out = (
+        context.make_array(signature.args[number])(context, builder, arguments[number])
+        for number in (0, 3, 7)
+    )
+    _, first, last, _, start, stride, step, _, position, row_step = arguments
+    depth = cgutils.unpack_tuple(builder, left.shape)[1]
+    memory = _Memory(builder, vector, vectors)
+    zero, one, row_count = (context.get_constant(types.intp, value) for value in (0, 1, rows))
+
+    def grid_of(function: Callable[[int, int], Any]) -> list[list[Any]]:
+        return [[function(row, part) for part in range(vectors)] for row in range(rows)]
+
+    def connect(phis: Any, block: Any, values: Any) -> None:
+        for phi, value in zip(phis, values, strict=True):
+            phi.add_incoming(value, block)
+
+    entry = builder.block
+    outer, inner, latch, done = (
+        builder.append_basic_block(name) for name in ("cells", "channels", "next", "sums")
+    )
+    factor_step = builder.mul(depth, row_count)
+    origin = first, builder.mul(first, factor_step), start
+    builder.branch(outer)
+
+    builder.position_at_end(outer)
+    counters = [builder.phi(depth.type) for _ in range(3)]
+    totals = grid_of(lambda row, part: builder.phi(vector))
+    builder.branch(inner)
+
+    builder.position_at_end(inner)
+    channel, factor_place, place = inner_counters = [builder.phi(depth.type) for _ in range(3)]
+    parts = grid_of(lambda row, part: builder.phi(vector))
+    values = memory.load_vectors(right, place)
+    factors = memory.load_factors(left, factor_place, rows)
+    name = f"llvm.fmuladd.v{lanes}f32"
+    added = grid_of(lambda row, part: _call(builder, name, factors[row], values[part], parts[row][part]))
+    following = builder.add(channel, one)
+    connect(inner_counters, outer, [zero, *counters[1:]])
+    moved = builder.add(factor_place, row_count), builder.add(place, stride)
+    connect(inner_counters, inner, [following, *moved])
+    for line, known, new in zip(parts, totals, added):
+        connect(line, outer, known)
+        connect(line, inner, new)
+    builder.cbranch(builder.icmp_signed("<", following, depth), inner, latch)
+
+    builder.position_at_end(latch)
+    following = builder.add(counters[0], one)
+    moved = builder.add(counters[1], factor_step), builder.add(counters[2], step)
+    connect(counters, entry, origin)
+    connect(counters, latch, [following, *moved])
+    for line, new in zip(totals, added):
+        connect(line, entry, [ir.Constant(vector, [0] * lanes)] * vectors)
+        connect(line, latch, new)
+    builder.cbranch(builder.icmp_signed("<", following, last), outer, done)
+
+    builder.position_at_end(done)
+    for line in added:
+        memory.add_vectors(out, position, line)
+        position = builder.sub(position, row_step)
+    return context.get_dummy_value()
+
+
+class _Memory:
+    """Generates the loads and stores of vectors; arrays need not be aligned to them."""
+
+    def __init__(self, builder: Any, vector: Any, vectors: int) -> None:
+        self._builder, self._vector, self._vectors = builder, vector, vectors
+
+    def _address(self, array: Any, place: Any, offset: int, kind: Any) -> Any:
+        place = self._builder.add(place, ir.Constant(place.type, offset)) if offset else place
+        return self._builder.bitcast(self._builder.gep(array.data, [place]), kind.as_pointer())
+
+    def _load(self, address: Any) -> Any:
+        value = self._builder.load(address)
+        value.align = 4
+        return value
+
+    def _addresses(self, array: Any, place: Any) -> list[Any]:
+        offsets = [self._vector.count * part for part in range(self._vectors)]
+        return [self._address(array, place, offset, self._vector) for offset in offsets]
+
+    def load_vectors(self, array: Any, place: Any) -> list[Any]:
+        """Load adjacent vectors."""
+        return [self._load(address) for address in self._addresses(array, place)]
+
+    def load_factors(self, array: Any, place: Any, count: int) -> list[Any]:
+        """Load adjacent numbers, each as a vector whose elements are all this number."""
+        kind = self._vector.element
+        numbers = [self._load(self._address(array, place, row, kind)) for row in range(count)]
+        return [_broadcast(self._builder, number, self._vector) for number in numbers]
+
+    def add_vectors(self, array: Any, place: Any, values: list[Any]) -> None:
+        """Add vectors to adjacent ones of an array."""
+        for address, value in zip(self._addresses(array, place), values):
+            self._builder.store(self._builder.fadd(self._load(address), value), address).align = 4
 
 
 def _broadcast(builder: Any, value: Any, vector: Any) -> Any:

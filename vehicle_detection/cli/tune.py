@@ -83,8 +83,8 @@ def tune(
     parquet = output.suffix.lower() == ".parquet"
     store = output.with_suffix(".jsonl") if parquet else output
     is_new = not store.exists()
-    options: dict[str, Any] = {"store": store, "options": TrialOptions(frames=labelled, cache=cache)}
-    options["progress"] = True
+    measured = TrialOptions(frames=labelled, cache=cache)
+    options: dict[str, Any] = {"store": store, "options": measured, "progress": True}
 
     def work() -> DataFrame:
         patches = load_training_patches(vehicles, non_vehicles, progress=sys.stderr.isatty())

@@ -47,7 +47,12 @@ from vehicle_detection.training.results import (
     write_results,
 )
 from vehicle_detection.training.trials import TrialConfig, TrialOptions, expand_grid, parse_grid
-from vehicle_detection.training.tuning import compare_classifiers, compare_configurations, search_parameters
+from vehicle_detection.training.tuning import (
+    Halving,
+    compare_classifiers,
+    compare_configurations,
+    search_parameters,
+)
 from vehicle_detection.training.validation import (
     FOLD_COLUMNS,
     FoldDetections,

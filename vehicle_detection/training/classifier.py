@@ -122,10 +122,7 @@ def train_classifier(
     >>> train_classifier(patches, labels, params=FeatureParams(hog_channel=0)).score(patches, labels)
     1.0
     """
-    params = FeatureParams() if params is None else params
-    options = TrainingOptions() if options is None else options
-    check_type(params, "params", FeatureParams, "omit it for the default")
-    check_type(options, "options", TrainingOptions, "omit it for the default")
+    params, options = check_training(params, options)
     if metadata is not None:
         check_type(metadata, "metadata", Mapping, "pass a dictionary")
     images, targets = _read_training_set(patches, labels)
@@ -206,6 +203,17 @@ def fit_features(
     versions = {"vehicle_detection": vehicle_detection.__version__, **libraries}
     all_metadata = {"training": training, "versions": versions, **(metadata or {})}
     return VehicleClassifier(params, (template,), all_metadata)
+
+
+def check_training(
+    params: FeatureParams | None, options: TrainingOptions | None
+) -> tuple[FeatureParams, TrainingOptions]:
+    """Return both, with the defaults for None."""
+    params = FeatureParams() if params is None else params
+    options = TrainingOptions() if options is None else options
+    check_type(params, "params", FeatureParams, "omit it for the default")
+    check_type(options, "options", TrainingOptions, "omit it for the default")
+    return params, options
 
 
 def check_labels(labels: ArrayLike, count: int) -> NDArray[np.int64]:

@@ -31,6 +31,7 @@ from vehicle_detection.svm import VehicleClassifier
 from vehicle_detection.training.classifier import (
     TrainingOptions,
     check_labels,
+    check_training,
     fit_features,
     patch_features,
 )
@@ -174,10 +175,7 @@ def train_and_evaluate(
     """
     check_type(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
     labels = check_labels(patch_set.labels, len(patch_set))
-    params = FeatureParams() if params is None else params
-    check_type(params, "params", FeatureParams, "omit it for the default")
-    options = TrainingOptions() if options is None else options
-    check_type(options, "options", TrainingOptions, "omit it for the default")
+    params, options = check_training(params, options)
     check_choice(split, "split", ("random", "sequences"))
     check_integer(seeds, "seeds", low=1, high=1000)
     random_state = check_integer(options.random_state, "random_state", low=0, high=2**32 - seeds)
@@ -197,10 +195,7 @@ def train_and_evaluate(
             return train(name, parts.train).decision_function(features[parts.test])
 
         final = pool.submit(train, "final")
-        running = {
-            name: [pool.submit(test_scores, name, parts) for parts in listed]
-            for name, listed in splits.items()
-        }
+        running = {name: [pool.submit(test_scores, name, part) for part in splits[name]] for name in splits}
         calibration = pool.submit(test_scores, "calibration", inner) if inner is not None else None
         scores = {}
         try:
@@ -212,8 +207,8 @@ def train_and_evaluate(
             error = None
             if calibration is not None and inner is not None:
                 platt = calibrate_scores(calibration.result(), labels[inner.test])
-                tested = labels[splits["sequences"][0].test]
-                error = calibration_error(platt.probability(running["sequences"][0].result()), tested)
+                probability = platt.probability(running["sequences"][0].result())
+                error = calibration_error(probability, labels[splits["sequences"][0].test])
             classifier = final.result()
         finally:
             pool.shutdown(cancel_futures=True)
