@@ -197,14 +197,13 @@ def train_and_evaluate(
         final = pool.submit(train, "final")
         running = {name: [pool.submit(test_scores, name, part) for part in splits[name]] for name in splits}
         calibration = pool.submit(test_scores, "calibration", inner) if inner is not None else None
-        scores = {}
+        scores, error = {}, None
         try:
             for name, listed in splits.items():
                 with step("leakage", fits=0):
                     leakage = split_leakage(patch_set, listed[0])
                 found = [future.result() for future in running[name]]
                 scores[name] = _score_split(listed, found, labels, leakage)
-            error = None
             if calibration is not None and inner is not None:
                 platt = calibrate_scores(calibration.result(), labels[inner.test])
                 probability = platt.probability(running["sequences"][0].result())
