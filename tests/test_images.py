@@ -1,5 +1,6 @@
 import errno
 import io
+import itertools
 import os
 import struct
 import zlib
@@ -67,16 +68,6 @@ def test_lossy_formats_keep_the_image_approximately(tmp_path, picture, suffix):
     assert np.abs(image.astype(int) - picture).mean() < 3
 
 
-def test_every_format_has_the_same_range(tmp_path):
-    ramp = np.tile(np.arange(256, dtype=np.uint8)[None, :, None], (16, 1, 3))
-    for suffix in LOSSLESS + LOSSY:
-        write_image(tmp_path / f"a{suffix}", ramp)
-        image = read_image(tmp_path / f"a{suffix}")
-        assert np.abs(image.astype(int) - ramp).max() <= 4
-        assert image.min() <= 4
-        assert image.max() >= 251
-
-
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff"])
 def test_gray_becomes_three_equal_channels(picture, suffix):
     gray = picture[..., 1]
@@ -133,8 +124,10 @@ def test_exif_rotation_is_applied(picture, orientation, turns):
     assert np.abs(image.astype(int) - upright).mean() < 3
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".webp"])
-@pytest.mark.parametrize("fraction", [0.02, 0.3, 0.7, 0.99])
+@pytest.mark.parametrize(
+    ("suffix", "fraction"),
+    [*itertools.product([".png", ".jpg", ".bmp", ".webp"], [0.02, 0.3, 0.7, 0.99]), (".jpg", 0.9999)],
+)
 def test_a_truncated_file_is_refused(tmp_path, picture, suffix, fraction):
     data = encoded(suffix, bgr(picture))
     file = tmp_path / f"cut{suffix}"
@@ -143,11 +136,6 @@ def test_a_truncated_file_is_refused(tmp_path, picture, suffix, fraction):
         InvalidInputError, match=r"image file .*cut.* must be a complete image file .*decoded"
     ):
         read_image(file)
-
-
-def test_a_jpeg_without_its_last_byte_is_refused(picture):
-    with pytest.raises(InvalidInputError, match="complete image file"):
-        decode_image(encoded(".jpg", bgr(picture))[:-1], "cut.jpg")
 
 
 def test_a_truncated_jpeg_with_a_complete_thumbnail_is_refused(picture):
@@ -248,13 +236,6 @@ def test_a_file_without_an_image_is_refused(tmp_path, content):
         read_image(file)
 
 
-def test_missing_file_and_folder(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"image file .*nothing.png does not exist; check the path"):
-        read_image(tmp_path / "nothing.png")
-    with pytest.raises(InvalidInputError, match=r"image file .* is a folder; choose a file in it"):
-        read_image(tmp_path)
-
-
 def test_an_unreadable_file(tmp_path, monkeypatch):
     def refuse(self, mode):
         raise PermissionError(13, "Permission denied")
@@ -263,26 +244,6 @@ def test_an_unreadable_file(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "open", refuse)
     with pytest.raises(InvalidInputError, match=r"a.png cannot be read: Permission denied"):
         read_image(tmp_path / "a.png")
-
-
-@pytest.mark.parametrize("name", ["a.xyz", "a", "a.", ".png", "a.txt"])
-def test_an_unknown_suffix_is_refused(tmp_path, picture, name):
-    with pytest.raises(InvalidInputError, match=r"path must end in .png, .jpg or another image suffix, got"):
-        write_image(tmp_path / name, picture)
-    assert not list(tmp_path.iterdir())
-
-
-def test_writing_needs_a_folder_and_an_image(tmp_path, picture, monkeypatch):
-    with pytest.raises(InvalidInputError, match="path needs an existing folder"):
-        write_image(tmp_path / "nowhere" / "a.png", picture)
-    with pytest.raises(InvalidInputError, match="image must be an"):
-        write_image(tmp_path / "a.png", picture[..., 0])
-    (tmp_path / "folder.png").mkdir()
-    with pytest.raises(InvalidInputError, match="path must be a file, got the folder"):
-        write_image(tmp_path / "folder.png", picture)
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    with pytest.raises(InvalidInputError, match="path needs a writable folder"):
-        write_image(tmp_path / "a.png", picture)
 
 
 def test_a_failed_write_keeps_the_earlier_file(tmp_path, picture, monkeypatch):
@@ -310,6 +271,30 @@ def test_writing_does_not_change_the_image(tmp_path, picture):
     np.testing.assert_array_equal(read_image(tmp_path / "b.png"), picture[::2, ::2])
 
 
-def test_a_url_is_no_file():
-    with pytest.raises(InvalidInputError, match=r"image file https://host/a.jpg is a URL; download it first"):
-        read_image("https://host/a.jpg")
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda _: read_image("nothing.png"), r"image file nothing.png does not exist; check the path"),
+        (lambda _: read_image("."), r"image file \. is a folder; choose a file in it"),
+        (lambda _: read_image("https://host/a.jpg"), r"https://host/a.jpg is a URL; download it first"),
+        (lambda image: write_image("nowhere/a.png", image), "path needs an existing folder"),
+        (lambda image: write_image("a.png", image[..., 0]), "image must be an"),
+        (lambda image: write_image("folder.png", image), "path must be a file, got the folder"),
+        *(
+            (lambda image, name=name: write_image(name, image), "path must end in .png, .jpg or another")
+            for name in ("a.xyz", "a", "a.", ".png", "a.txt")
+        ),
+    ],
+)
+def test_bad_paths_and_images(tmp_path, monkeypatch, picture, call, message):
+    monkeypatch.chdir(tmp_path)
+    Path("folder.png").mkdir()
+    with pytest.raises(InvalidInputError, match=message):
+        call(picture)
+    assert os.listdir(tmp_path) == ["folder.png"]
+
+
+def test_a_folder_that_is_not_writable(tmp_path, picture, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(InvalidInputError, match="path needs a writable folder"):
+        write_image(tmp_path / "a.png", picture)
