@@ -14,10 +14,12 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import IO, Any
+
+from numpy.typing import NDArray
 
 from vehicle_detection._common import Limit, hide_credentials
 from vehicle_detection.errors import TransientVideoError, VideoError
@@ -245,6 +247,16 @@ class Process:
         if pid:
             self._popen.returncode = os.waitstatus_to_exitcode(status)
             self.cpu_seconds = usage.ru_utime + usage.ru_stime
+
+    def read_into(self, buffer: NDArray[Any], ready: Callable[[], bool] = lambda: True) -> bool:
+        """Fill a buffer from its output; False at the end, or when `ready` is False before a read."""
+        view, done = buffer.data.cast("B"), 0
+        while done < len(view):
+            size = self.stdout.readinto(view[done:]) if ready() else 0
+            if not size:
+                return False
+            done += size
+        return True
 
     def kill(self) -> None:
         """End the process at once; threads that read from it or write to it stop waiting."""

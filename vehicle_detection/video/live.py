@@ -100,13 +100,7 @@ class _LiveProcess:
         """Read the next frame into `planes`; False at the end of the stream."""
         if not self._read_line(NETWORK_TIMEOUT):
             return False
-        view, done = planes.data.cast("B"), 0
-        while done < len(view):
-            size = self.process.stdout.readinto(view[done:]) if self._has_data(NETWORK_TIMEOUT) else 0
-            if not size:
-                return False
-            done += size
-        return True
+        return self.process.read_into(planes, lambda: self._has_data(NETWORK_TIMEOUT))
 
     def _read_line(self, timeout: float) -> bytes:
         """Read a line of a header; empty at the end of the stream."""

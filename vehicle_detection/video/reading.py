@@ -139,14 +139,9 @@ class FrameReader(Reader):
     def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
         if self._process.stdout.closed:
             raise StopIteration
-        view = self._buffer.data.cast("B")
-        done = 0
-        while done < len(view):
-            size = self._process.stdout.readinto(view[done:])
-            if not size:
-                self._finish()
-                raise StopIteration
-            done += size
+        if not self._process.read_into(self._buffer):
+            self._finish()
+            raise StopIteration
         if self._in_planes:
             frame = rgb_from_planes(self._buffer, self.info.color_encoding, self._channels)
         else:
