@@ -373,7 +373,8 @@ class _Sink(Closing):
     """
 
     def __init__(self, writer: AbstractContextManager[FrameWriter]) -> None:
-        self._open_writer, self._writer = writer, None
+        self._open_writer = writer
+        self._writer: FrameWriter | None = None
         self._pictures: ClosableQueue[tuple[NDArray[np.uint8], int]] = ClosableQueue(2)
         self._thread = threading.Thread(target=self._encode, name="vehicle-encode")
         self._lock = threading.Lock()
