@@ -16,12 +16,13 @@ from vehicle_detection import (
     render_scene,
     write_image,
 )
-from vehicle_detection.drive import TrackLog, explain_tracks
+from vehicle_detection.drive import explain_tracks
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.explanation import patch_cell_shares
 from vehicle_detection.features import part_slices
 from vehicle_detection.function_model import FunctionModel
 from vehicle_detection.scenes import SceneVehicle
+from vehicle_detection.tables import TrackTable
 
 CARS = [SceneVehicle(distance_m=14.0, kind="sedan"), SceneVehicle(distance_m=9.0, lateral_m=4.2, kind="suv")]
 SCENE = render_scene(shape=(360, 640), vehicles=CARS, lane=1, random_state=1)
@@ -159,12 +160,14 @@ def test_bad_boxes_are_refused(detector, box, message):
 @pytest.mark.parametrize(("seconds", "frame"), [((0.0, 0.04), 0), ((0.04, 0.08), 1)])
 def test_a_detected_box_of_a_track_is_explained(detector, tmp_path, seconds, frame):
     # Without any detected box, the largest predicted one.
-    log, box = TrackLog(), detector.detect(SCENE.image).boxes[0]
+    table, box = TrackTable(), detector.detect(SCENE.image).boxes[0]
     for index, time_since_update in enumerate(seconds):
         write_image(tmp_path / f"{index}.png", SCENE.image)
         larger = box + index * np.array([-1, -1, 1, 1])
-        log.add(index, index / 25, [SimpleNamespace(id=1, box=larger, time_since_update=time_since_update)])
-    (picture,) = explain_tracks(detector, tmp_path, log)
+        table.append(
+            index, index / 25, [SimpleNamespace(id=1, box=larger, time_since_update=time_since_update)]
+        )
+    (picture,) = explain_tracks(detector, tmp_path, table)
     assert (picture.track, picture.frame) == (1, frame)
     assert "margin" in picture.text
     assert "not found" not in picture.text

@@ -111,14 +111,14 @@ import vehicle_detection
 print(len([importlib.import_module(name) for name in names()]))
 
 from vehicle_detection._common import atomic_write, available_cores, temporary_folder
-from vehicle_detection.drive.batch_store import LocalStore
+from vehicle_detection.drive.batch_store import open_store
 from vehicle_detection.cli.signals import raise_on_signals
 
 folder = Path(tempfile.mkdtemp())
 with atomic_write(folder / "a.csv") as part, temporary_folder(folder, "b") as inner:
     part.write_text("whole")
     (inner / "c").touch()
-with LocalStore(folder).lock("a") as free, raise_on_signals():
+with open_store(folder).lock("a") as free, raise_on_signals():
     handled = callable(signal.getsignal(signal.SIGBREAK))
     print(free, handled, available_cores() > 0, sorted(path.name for path in folder.iterdir()))
 """

@@ -205,7 +205,7 @@ class _Valid:
         search = vd.SearchParams(bands=(band,))
         detector = vd.VehicleDetector(classifier, n_jobs=1)
         result = detector.process(image)
-        tracker, log, own_speed = vd.Tracker(), vd.TrackLog(), vd.OwnSpeed.constant(25.0)
+        tracker, log, own_speed = vd.Tracker(), vd.TrackTable(), vd.OwnSpeed.constant(25.0)
         report = vd.VideoReport(
             frames=1, fps=Fraction(25), shape=image.shape, seconds=1.0, stages={"search": 1.0}, tracks=0
         )
@@ -236,7 +236,7 @@ class _Valid:
             "OwnSpeed": own_speed, "PatchFeatures": vd.PatchFeatures(n_jobs=1), "PatchSet": patch_set,
             "Platt": vd.Platt(-1.0, 0.0),
             "ReportWriter": vd.ReportWriter(folder / "writer.html"),
-            "SearchParams": search, "TrackLog": log,
+            "SearchParams": search, "TrackTable": log,
             "Tracker": tracker, "VehicleClassifier": classifier, "VehicleDetector": detector,
         }  # fmt: skip
         self.by_name: dict[str, Any] = {

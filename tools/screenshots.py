@@ -96,7 +96,7 @@ def _write_report(folder: Path, detector: VehicleDetector) -> Path:
     done = process_video(clip, annotated, detector, on_result=add)
     _check(boxes, drive.truth_of(REPORT_FRAME))
     camera = detector.camera_of(done.shape)
-    write.finish(done, events=find_events(write.log, fps=drive.fps, shape=done.shape, camera=camera))
+    write.finish(done, events=find_events(write.table, fps=drive.fps, shape=done.shape, camera=camera))
     return page
 
 

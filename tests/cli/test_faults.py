@@ -18,11 +18,11 @@ import pytest
 from tests.cli.commands import failing, finish, run, start_changed
 from tests.helpers import ROOT
 from tests.video.clips import gray_frames, write_clip
-from vehicle_detection import detector, export, video
+from vehicle_detection import detector, drive, export, tables, video
 from vehicle_detection._common import files
 from vehicle_detection._kernels.jit import jit
 from vehicle_detection.cli.signals import raise_on_signals
-from vehicle_detection.drive import event_files, events, report
+from vehicle_detection.drive import event_files, events
 from vehicle_detection.errors import OutputError
 from vehicle_detection.images import write_image
 from vehicle_detection.scenes import render_patches, render_scene
@@ -227,7 +227,7 @@ def test_an_interrupt_while_clips_are_cut_keeps_all_other_files(clip, tmp_path, 
         events.Event(kind=kind, track_id=number, frame=5, start_frame=4, end_frame=6, time_s=0.2)
         for number, kind in enumerate(kinds)
     )
-    monkeypatch.setattr(events, "find_events", lambda *_, **__: found)
+    monkeypatch.setattr(drive, "find_events", lambda *_, **__: found)
     cut = event_files.cut_video
 
     def interrupt(source, target, **options):
@@ -261,13 +261,13 @@ def test_a_disk_that_is_full_while_tracks_are_written(clip, tmp_path, monkeypatc
 
 
 def test_a_target_that_becomes_a_folder_while_the_video_is_made(clip, tmp_path, monkeypatch):
-    add = report.ReportWriter.write
+    append = tables.TrackTable.append
 
     def replace(self, *args):
         (tmp_path / "out.csv").mkdir(exist_ok=True)
-        add(self, *args)
+        append(self, *args)
 
-    monkeypatch.setattr(report.ReportWriter, "write", replace)
+    monkeypatch.setattr(tables.TrackTable, "append", replace)
     words = ["-o", tmp_path / "out.mp4", "--tracks", tmp_path / "out.csv", "--report", tmp_path / "out.html"]
     result = run("video", clip, *words, "--model", "highway", "-q")
     assert result.exit_code == 2

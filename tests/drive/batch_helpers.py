@@ -8,7 +8,7 @@ import pytest
 
 from vehicle_detection import run_batch
 from vehicle_detection.drive.batch_plan import source_id
-from vehicle_detection.drive.batch_store import LocalStore
+from vehicle_detection.drive.batch_store import open_store
 from vehicle_detection.video import probe_video
 
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -23,7 +23,7 @@ def run(sources, out, model, **options):
 def unfinished(out, source):
     """Lock a trip, as another run does that works on it: a batch with this trip outlasts the block."""
     pytest.importorskip("fcntl")
-    with LocalStore(out).lock(source_id(str(source))) as locked:
+    with open_store(out).lock(source_id(str(source))) as locked:
         assert locked
         yield
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from vehicle_detection import Camera, Detections, Tracker
-from vehicle_detection.drive import TrackLog
+from vehicle_detection import Camera, Detections, Tracker, TrackTable
 from vehicle_detection.scenes.drive import make_traffic
 
 FPS, SHAPE = 12.5, (720, 1280)
@@ -25,12 +24,12 @@ def box_of(vehicle, time):
 
 
 def simulate(scenario, seed, **options):
-    """Vehicles of a scenario, and the log of their tracks."""
-    log = TrackLog()
+    """Vehicles of a scenario, and the table of their tracks."""
+    table = TrackTable()
     traffic = make_traffic(scenario, 10.0, np.random.default_rng(seed))[1]
     for frame in log_frames(scenario, seed, **options):
-        log.add(*frame)
-    return traffic, log
+        table.append(*frame)
+    return traffic, table
 
 
 def log_frames(scenario, seed, *, seconds=10.0, noise=0.03):

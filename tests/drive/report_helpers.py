@@ -1,5 +1,6 @@
 """Runs and pages of reports for the tests."""
 
+import math
 import re
 from fractions import Fraction
 from html.parser import HTMLParser
@@ -15,6 +16,7 @@ VOID_ELEMENTS = {"meta", "link", "source", "img"}
 def track(number, *, distance=20.0, distance_std=2.0, speed=1.5, speed_std=0.5, confidence=1.0, shown=True):
     return SimpleNamespace(
         id=number,
+        box=(math.nan,) * 4,
         shown=shown,
         distance_m=distance,
         distance_std_m=distance_std,
@@ -41,7 +43,7 @@ def write_report(folder, frames, **options):
     """Write a report of the tracks of each frame; return its text."""
     writer = ReportWriter(folder / "report.html", **options)
     for index, tracks in enumerate(frames):
-        writer.write(index, index / FPS, tracks)
+        writer.table.append(index, index / FPS, tracks)
     writer.finish(video_report(len(frames)))
     return (folder / "report.html").read_text(encoding="utf-8")
 

@@ -183,14 +183,14 @@ def test_a_full_disk_is_an_error_that_the_next_run_repeats(card, model, tmp_path
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(store.LocalStore, "publish", fill)
+        patch.setattr(store.Store, "publish", fill)
         report = run(source, out, model)
     assert counts(report) == (0, 0, 1, 0)
     assert "No space left" in next(iter(report.messages.values()))
     assert batch_status(out).errors == 1
     assert counts(run(source, out, model)) == (1, 0, 0, 0)
     check_whole(out, done=1, failed=0)
-    assert not list((tmp_path / "scratch").iterdir())
+    assert not list((tmp_path / "scratch").glob(".vehicle-*"))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from tests.drive.report_helpers import track
-from vehicle_detection import Event, TrackLog, count_vehicles
+from vehicle_detection import Event, TrackTable, count_vehicles
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -16,12 +16,12 @@ def event(kind, frame, number=1):
 
 
 def test_counts_are_the_sums_of_their_minutes():
-    log = TrackLog()
+    table = TrackTable()
     for frame in range(290):  # 145 s
-        log.add(frame, None, [track(number) for number in range(1, 2 + (frame >= 120))])
+        table.append(frame, None, [track(number) for number in range(1, 2 + (frame >= 120))])
     events = [event("met", 10), event("met", 130), event("overtaken", 119), event("overtaking", 289)]
     events += [event("passed", 240), event("cut_in", 20)]
-    counts = count_vehicles(events, log, fps=2)
+    counts = count_vehicles(events, table, fps=2)
     assert [(minute.start_s, minute.seconds) for minute in counts.minutes] == [(0, 60), (60, 60), (120, 25)]
     assert [minute.met for minute in counts.minutes] == [1, 1, 0]
     assert [minute.overtaken for minute in counts.minutes] == [1, 0, 0]
@@ -35,7 +35,7 @@ def test_counts_are_the_sums_of_their_minutes():
 
 
 def test_an_empty_drive_has_no_minutes():
-    counts = count_vehicles([], TrackLog(), fps=25)
+    counts = count_vehicles([], TrackTable(), fps=25)
     assert (counts.minutes, dataclasses.astuple(counts.total)) == ((), (0, 0, 0, 0, 0, 0, 0, 0))
     with pytest.raises(InvalidInputError, match="fps must be a number, greater than 0"):
-        count_vehicles([], TrackLog(), fps=0)
+        count_vehicles([], TrackTable(), fps=0)

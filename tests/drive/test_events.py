@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.drives import CAMERA, FPS, SHAPE, cut_in_times, log_frames, passing_times, simulate
-from vehicle_detection import Camera, Event, TrackLog, find_events
+from vehicle_detection import Camera, Event, TrackTable, find_events
 from vehicle_detection._common import UNITS
-from vehicle_detection.drive.history import TrackHistory
+from vehicle_detection.drive.history import track_histories
 from vehicle_detection.drive.motion import estimate_motion
 from vehicle_detection.errors import InvalidInputError
 
@@ -77,8 +77,8 @@ def test_oncoming_vehicles_are_met():
 def test_time_to_collision_is_within_15_percent_at_3_seconds():
     errors, normalized = [], []
     for seed in SEEDS:
-        (vehicle,), log = simulated("closing", seed)
-        motion = estimate_motion(log.histories()[0], fps=FPS, shape=SHAPE, camera=CAMERA)
+        (vehicle,), table = simulated("closing", seed)
+        motion = estimate_motion(track_histories(table)[0], fps=FPS, shape=SHAPE, camera=CAMERA)
         true = np.array([vehicle.distance(time) / -vehicle.relative_speed(time) for time in motion.seconds])
         near = np.abs(true - 3) < 0.4
         difference = motion.time_to_collision[near] - true[near]
@@ -102,13 +102,13 @@ def test_a_vehicle_that_closes_in_is_an_event():
 
 
 def test_frames_that_were_not_processed_do_not_change_the_speeds():
-    (_, log), dropped = simulated("closing", 0), TrackLog()
+    (_, table), dropped = simulated("closing", 0), TrackTable()
     number = 0
     for frame, time, tracks in log_frames("closing", 0):
         if frame % 2 == 0:
-            dropped.add(number, time, tracks)
+            dropped.append(number, time, tracks)
             number += 1
-    whole, half = (find_events(each, fps=FPS, shape=SHAPE) for each in (log, dropped))
+    whole, half = (find_events(each, fps=FPS, shape=SHAPE) for each in (table, dropped))
     found, expected = (next(event for event in events if event.ttc_s is not None) for events in (half, whole))
     assert found.kind == expected.kind
     assert found.ttc_s == pytest.approx(expected.ttc_s, rel=0.15)
@@ -116,9 +116,9 @@ def test_frames_that_were_not_processed_do_not_change_the_speeds():
 
 
 def test_the_headway_is_at_the_smallest_stated_distance():
-    log = simulated("closing", 0)[1]
-    (history,) = (each for each in log.histories() if each.id == 1)
-    for event in find_events(log, fps=FPS, shape=SHAPE):
+    table = simulated("closing", 0)[1]
+    (history,) = (each for each in track_histories(table) if each.id == 1)
+    for event in find_events(table, fps=FPS, shape=SHAPE):
         if event.kind == "headway" and event.track_id == 1:
             rows = (history.frames >= event.start_frame) & (history.frames <= event.end_frame)
             stated = history.columns["distance_m"][rows]
@@ -174,8 +174,8 @@ def test_an_event_is_described_in_units():
 
 def test_what_is_stated_is_known_and_in_order():
     for scenario in ("passing", "cut_in"):
-        log, events = simulated(scenario, 1)[1], events_of(scenario, 1)
-        frames = {track.id: track.frames.tolist() for track in log.histories()}
+        table, events = simulated(scenario, 1)[1], events_of(scenario, 1)
+        frames = {track.id: track.frames.tolist() for track in track_histories(table)}
         assert [event.frame for event in events] == sorted(event.frame for event in events)
         for event in events:
             assert event.start_frame <= event.frame <= event.end_frame
@@ -189,15 +189,15 @@ def test_what_is_stated_is_known_and_in_order():
 
 
 def test_the_camera_changing_lanes_is_no_cut_in():
-    log = simulated("cut_in", 0)[1]
-    (event,) = listed(find_events(log, fps=FPS, shape=SHAPE), "cut_in")
-    mover = next(track for track in log.histories() if any(e.track_id == track.id for e in
-                 find_events(log, fps=FPS, shape=SHAPE) if e.kind == "cut_in"))  # fmt: skip
+    table = simulated("cut_in", 0)[1]
+    (event,) = listed(find_events(table, fps=FPS, shape=SHAPE), "cut_in")
+    mover = next(track for track in track_histories(table) if any(e.track_id == track.id for e in
+                 find_events(table, fps=FPS, shape=SHAPE) if e.kind == "cut_in"))  # fmt: skip
     shift = np.array([200.0, 0, 200, 0]) * (1 if event[1] == "right" else -1)
-    boxes = mover.boxes + shift
-    columns = {**mover.columns, **dict(zip(("x1", "y1", "x2", "y2"), boxes.T))}
-    companion = dataclasses.replace(mover, id=99, columns=columns)
-    found = find_events([mover, companion], fps=FPS, shape=SHAPE)
+    columns = {name: np.tile(values, 2) for name, values in mover.columns.items()}
+    numbers, boxes = np.repeat([mover.id, 99], len(mover.frames)), [*mover.boxes, *(mover.boxes + shift)]
+    both = TrackTable(np.tile(mover.frames, 2), numbers, boxes, **columns)
+    found = find_events(both, fps=FPS, shape=SHAPE)
     assert not listed(found, "cut_in")
 
 
@@ -210,11 +210,10 @@ def test_any_track_gives_consistent_events(seed, known, speed):
     x, y = first[0] + steps[:, 0], first[1] + steps[:, 1]
     sides = 20 * np.exp(np.abs(steps[:, 2:]) / 30)
     boxes = np.clip(np.stack([x, y, x + sides[:, 0], y + sides[:, 1]], axis=1), 0, [1280, 720, 1280, 720])
-    columns = dict(zip(("x1", "y1", "x2", "y2"), boxes.T))
     distance = 2000 / sides[:, 1] if known else np.full(len(frames), np.nan)
-    columns |= {"distance_m": distance, "distance_std_m": 0.1 * distance}
-    track = TrackHistory(1, frames, columns)
-    for event in find_events([track], fps=FPS, shape=SHAPE, own_speed_mps=speed):
+    ones = np.ones(len(frames), int)
+    table = TrackTable(frames, ones, boxes, distance_m=distance, distance_std_m=0.1 * distance)
+    for event in find_events(table, fps=FPS, shape=SHAPE, own_speed_mps=speed):
         assert event.start_frame <= event.frame <= event.end_frame
         assert event.ttc_s is None or event.ttc_s > 0
         assert event.distance_m is None or event.distance_m > 0
@@ -222,19 +221,19 @@ def test_any_track_gives_consistent_events(seed, known, speed):
 
 
 def test_a_camera_of_another_size_is_scaled_or_refused():
-    log = simulated("cut_in", 0)[1]
+    table = simulated("cut_in", 0)[1]
     large = Camera.for_frame((2 * SHAPE[0], 2 * SHAPE[1]))
-    same = find_events(log, fps=FPS, shape=SHAPE, camera=Camera.for_frame(SHAPE))
-    assert find_events(log, fps=FPS, shape=SHAPE, camera=large) == same
+    same = find_events(table, fps=FPS, shape=SHAPE, camera=Camera.for_frame(SHAPE))
+    assert find_events(table, fps=FPS, shape=SHAPE, camera=large) == same
     with pytest.raises(InvalidInputError, match="camera must be one for frames of"):
-        find_events(log, fps=FPS, shape=(500, 500), camera=large)
+        find_events(table, fps=FPS, shape=(500, 500), camera=large)
 
 
 def test_no_tracks_give_no_events():
-    assert find_events(TrackLog(), fps=25, shape=(720, 1280)) == ()
-    log = TrackLog()
-    log.add(0, None, [])
-    assert find_events(log, fps=25, shape=(720, 1280)) == ()
+    assert find_events(TrackTable(), fps=25, shape=(720, 1280)) == ()
+    table = TrackTable()
+    table.append(0, None, [])
+    assert find_events(table, fps=25, shape=(720, 1280)) == ()
 
 
 @pytest.mark.parametrize(
@@ -249,9 +248,9 @@ def test_no_tracks_give_no_events():
     ],
 )
 def test_bad_arguments_are_refused(options, message):
-    log = simulated("closing", 0)[1]
+    table = simulated("closing", 0)[1]
     with pytest.raises(InvalidInputError, match=message):
-        find_events(log, **({"fps": FPS, "shape": SHAPE} | options))
+        find_events(table, **({"fps": FPS, "shape": SHAPE} | options))
 
 
 def test_events_are_values():
@@ -267,22 +266,19 @@ def test_no_vehicle_is_followed_while_it_is_not_seen():
 
     frames = np.array([*range(8), *range(95, 103)])
     boxes = np.array([box(frame) for frame in frames], float)
-    known = {"distance_m": 20.0, "distance_std_m": 1.0}
-    columns = {**dict(zip(("x1", "y1", "x2", "y2"), boxes.T))}
-    blank = simulated("highway", 0)[1].histories()[0].columns
-    columns |= {name: np.full(len(frames), known.get(name, np.nan)) for name in blank if name not in columns}
-    found = find_events([TrackHistory(1, frames, columns)], fps=25, shape=SHAPE)
+    known = {"distance_m": np.full(16, 20.0), "distance_std_m": np.ones(16)}
+    found = find_events(TrackTable(frames, np.ones(16, int), boxes, **known), fps=25, shape=SHAPE)
     assert not listed(found, "headway")
 
 
 def test_distances_of_a_fisheye_lens():
     """A car in the next lane, whose box at the border of the image is far from that of a pinhole camera."""
     camera = dataclasses.replace(CAMERA, fisheye=True)
-    (history,) = simulated("closing", 0)[1].histories()[:1]
-    moved = {**history.columns, "x1": history.columns["x1"] + 200, "x2": history.columns["x2"] + 200}
-    far = dataclasses.replace(history, columns={**moved, "distance_m": np.full(len(history.frames), np.nan)})
+    (history,) = track_histories(simulated("closing", 0)[1])[:1]
+    unknown = {**history.columns, "distance_m": np.full(len(history.frames), np.nan)}
+    far = dataclasses.replace(history, boxes=history.boxes + np.array([200.0, 0, 200, 0]), columns=unknown)
     boxes = camera.rectify_boxes(far.boxes, SHAPE)
-    plain = dataclasses.replace(far, columns={**far.columns, **dict(zip(("x1", "y1", "x2", "y2"), boxes.T))})
+    plain = dataclasses.replace(far, boxes=boxes)
     found = estimate_motion(far, fps=FPS, shape=SHAPE, camera=camera)
     expected = estimate_motion(plain, fps=FPS, shape=SHAPE, camera=CAMERA)
     inside = boxes[:, 2] < 1200

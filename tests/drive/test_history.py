@@ -1,7 +1,6 @@
-"""The data that a report keeps of a run."""
+"""The tracks of a table, one by one."""
 
 import math
-import pickle
 from itertools import pairwise
 
 import numpy as np
@@ -10,25 +9,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.report_helpers import track
-from vehicle_detection import OwnSpeed
-from vehicle_detection.drive.history import TrackHistory, TrackLog, bin_means
+from vehicle_detection import OwnSpeed, TrackTable
+from vehicle_detection.drive import own_speeds
+from vehicle_detection.drive.history import TrackHistory, bin_means, track_histories
 
 PRESENCE = st.lists(st.sets(st.integers(1, 4)), max_size=40)
 
 
-def log_of(frames):
-    """Log of the ids of the tracks in each frame."""
-    log = TrackLog()
+def table_of(frames):
+    """Table of the ids of the tracks in each frame."""
+    table = TrackTable()
     for index, numbers in enumerate(frames):
-        log.add(index, None, [track(number, distance=index + number) for number in sorted(numbers)])
-    return log
+        table.append(index, None, [track(number, distance=index + number) for number in sorted(numbers)])
+    return table
 
 
 @given(PRESENCE)
-def test_the_log_keeps_the_frames_and_values_of_each_track(frames):
-    log = log_of(frames)
-    assert list(log.counts) == [len(numbers) for numbers in frames]
-    histories = log.histories()
+def test_histories_have_the_frames_and_values_of_each_track(frames):
+    table = table_of(frames)
+    histories = track_histories(table)
     assert {each.id for each in histories} == set().union(*frames)
     for each in histories:
         assert each.frames.tolist() == [index for index, numbers in enumerate(frames) if each.id in numbers]
@@ -38,14 +37,6 @@ def test_the_log_keeps_the_frames_and_values_of_each_track(frames):
         assert all(stop < start for (_, stop), (start, _) in pairwise(spans))
     order = [(each.first, each.id) for each in histories]
     assert order == sorted(order)
-
-
-def test_a_log_can_be_pickled():
-    log = log_of([{1}, {1, 2}])
-    copied = pickle.loads(pickle.dumps(log))
-    copied.add(2, None, [track(3)])
-    assert [each.id for each in copied.histories()] == [1, 2, 3]
-    assert [each.id for each in log.histories()] == [1, 2]
 
 
 @given(st.sets(st.integers(0, 60), min_size=1), st.integers(1, 10), st.data())
@@ -66,7 +57,7 @@ def history(frames, distances):
     columns = {name: np.full(len(frames), math.nan) for name in ("speed_mps", "speed_std_mps", "confidence")}
     columns["distance_m"] = np.array(distances, float)
     columns["distance_std_m"] = np.ones(len(frames))
-    return TrackHistory(1, np.array(frames, np.int64), columns)
+    return TrackHistory(1, np.array(frames, np.int64), np.zeros((len(frames), 4)), columns)
 
 
 def test_an_outlier_is_not_the_closest_approach():
@@ -84,14 +75,6 @@ def test_the_closest_approach_of_few_known_distances():
     assert history([5], [math.nan]).closest_approach(25.0) is None
 
 
-def test_frames_that_a_live_source_dropped():
-    log = TrackLog()
-    for frame in (0, 1, 5, 6):
-        log.add(frame, frame / 10, [track(1)] if frame < 6 else [])
-    assert list(log.counts) == [1, 1, 1, 1, 1, 1, 0]
-    assert log.histories()[0].frames.tolist() == [0, 1, 5]
-
-
 def test_the_closest_approach_does_not_depend_on_the_unit():
     rng = np.random.default_rng(0)
     for _ in range(50):
@@ -100,19 +83,10 @@ def test_the_closest_approach_does_not_depend_on_the_unit():
         assert meters.frame == feet.frame
 
 
-def test_times_of_frames_that_are_not_evenly_spaced():
-    log = TrackLog()
+def test_speeds_in_frames_that_are_not_evenly_spaced():
+    table = TrackTable()
     for frame, time in enumerate((5.0, 5.1, None, 5.5)):
-        log.add(frame, time, [track(1)])
-    assert log.histories()[0].times.tolist() == pytest.approx([5.0, 5.1, 5.3, 5.5])
+        table.append(frame, time, [track(1)])
+    assert track_histories(table)[0].times.tolist() == pytest.approx([5.0, 5.1, 5.3, 5.5])
     speed = OwnSpeed(np.array([5.0, 6.0]), np.array([10.0, 20.0]))
-    assert log.own_speeds(speed, 25).tolist() == pytest.approx([10, 11, 13, 15])
-    repeated = TrackLog()
-    for frame, time in enumerate((1.0, 1.1, 1.1, 1.3)):
-        repeated.add(frame, time, [track(1)])
-    assert repeated.histories()[0].times.tolist() == pytest.approx([1.0, 1.1, 1.2, 1.3])
-    for times in ((1.0, 1.0), (1.0, 0.5), (None, 1.0), (None, None)):
-        other = TrackLog()
-        for frame, time in enumerate(times):
-            other.add(frame, time, [track(1)])
-        assert other.histories()[0].times is None
+    assert own_speeds(speed, table, fps=25).tolist() == pytest.approx([10, 11, 13, 15])

@@ -19,9 +19,9 @@ def motion_of(seconds, errors):
     height = CAMERA.focal_px * CAMERA.vehicle_height_m / distance * (1 + errors)
     half, bottom = 0.6 * height, CAMERA.horizon_px + CAMERA.focal_px * CAMERA.height_m / distance
     columns = {name: np.full(len(times), np.nan) for name in COLUMNS}
-    columns |= {"x1": 640 - half, "y1": bottom - height, "x2": 640 + half, "y2": bottom}
+    boxes = np.stack([640 - half, bottom - height, 640 + half, bottom], axis=1)
     columns |= {"distance_m": distance, "distance_std_m": 0.1 * distance}
-    track = TrackHistory(1, np.arange(len(times)), columns)
+    track = TrackHistory(1, np.arange(len(times)), boxes, columns)
     return times, estimate_motion(track, fps=FPS, shape=SHAPE, camera=CAMERA)
 
 
@@ -57,11 +57,10 @@ def test_errors_of_the_time_to_collision_fit_at_the_end_of_a_track_too(seconds):
 
 def test_a_vehicle_of_constant_size_has_no_time_to_collision():
     columns = {name: np.full(100, np.nan) for name in COLUMNS}
-    columns |= {
-        name: np.full(100, side) for name, side in zip(("x1", "y1", "x2", "y2"), (600.0, 400, 680, 464))
-    }
+    boxes = np.tile([600.0, 400, 680, 464], (100, 1))
     columns |= {"distance_m": np.full(100, 20.0), "distance_std_m": np.full(100, 2.0)}
-    motion = estimate_motion(TrackHistory(1, np.arange(100), columns), fps=FPS, shape=SHAPE, camera=CAMERA)
+    track = TrackHistory(1, np.arange(100), boxes, columns)
+    motion = estimate_motion(track, fps=FPS, shape=SHAPE, camera=CAMERA)
     # Slopes of 0, or of the rounding error.
     assert (np.abs(motion.time_to_collision) > 1e9).all()
     assert (motion.slope_error > 1e9).all()

@@ -13,7 +13,8 @@ from vehicle_detection import InvalidInputError, OwnSpeed, read_own_speed
 
 POINT = '<trkpt lat="{lat}" lon="{lon}"><ele>5</ele><time>{time}</time>{speed}</trkpt>'
 GPX = (
-    '<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{}</trkseg></trk></gpx>'
+    '<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1" xmlns:x="x" xmlns:t="t">'
+    "<trk><trkseg>{}</trkseg></trk></gpx>"
 )
 DEGREE_M = 6_371_009 * math.pi / 180
 

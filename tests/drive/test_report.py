@@ -1,12 +1,11 @@
 """Files: the page, and a video embedded in it or linked from it."""
 
 import base64
-import math
 from urllib.parse import unquote
 
 import pytest
 
-from tests.drive.report_helpers import FRAMES, StrictParser, track, video_report, write_report
+from tests.drive.report_helpers import FRAMES, StrictParser, video_report, write_report
 from vehicle_detection.drive import ReportWriter
 from vehicle_detection.drive import report as writer
 from vehicle_detection.drive import report_page as page
@@ -89,39 +88,12 @@ def test_rejects_paths_that_cannot_be_written(tmp_path):
     assert list(tmp_path.iterdir()) == [tmp_path / "folder.html"]
 
 
-@pytest.mark.parametrize(
-    ("frame", "message"),
-    [
-        ((0.5, 0.0, []), "index must be an integer at least 0"),
-        ((0, math.nan, []), "time must be a number"),
-        ((0, 0.0, None), r"tracks must be Track objects, got None; pass result.tracks"),
-        ((0, 0.0, "abc"), "tracks must be Track objects, got 'abc'"),
-        ((0, 0.0, [(1, 2)]), r"tracks must be Track objects, got \(1, 2\) \(tuple\)"),
-        ((0, 0.0, [track(1), track(1)]), "tracks must have unique ids, got 1 twice in one frame"),
-        ((0, 0.0, [track(-1)]), "track.id must be an integer at least 0; got -1"),
-        (
-            (0, 0.0, [track(1, distance="far")]),
-            r"track.distance_m must be a number or None, got 'far'",
-        ),
-        ((0, 0.0, [track(1, speed=True)]), "track.speed_mps must be a number or None, got True"),
-    ],
-)
-def test_rejects_malformed_frames(tmp_path, frame, message):
-    report = ReportWriter(tmp_path / "report.html")
-    with pytest.raises(InvalidInputError, match=message):
-        report.write(*frame)
-    # Nothing of the rejected frame is kept: the right one can still be written.
-    report.write(0, 0.0, [track(1)])
-    with pytest.raises(InvalidInputError, match="index must be at least 1, as frames are added in order"):
-        report.write(0, 0.0, [])
-
-
 def test_an_earlier_page_stays_if_a_new_one_fails(tmp_path, monkeypatch):
     video = tmp_path / "video.mp4"
     video.write_bytes(b"video")
     before = write_report(tmp_path, FRAMES)
     report = ReportWriter(tmp_path / "report.html", video=tmp_path / "missing.mp4")
-    report.write(0, 0.0, [])
+    report.table.append(0, 0.0, [])
     with pytest.raises(
         InvalidInputError, match=r"missing.mp4 does not exist; call finish after process_video"
     ):

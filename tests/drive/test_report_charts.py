@@ -5,7 +5,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from tests.drive.test_history import PRESENCE, log_of
+from tests.drive.test_history import PRESENCE, table_of
+from vehicle_detection.drive.history import track_histories
 from vehicle_detection.drive.report_charts import (
     Label,
     TimeAxis,
@@ -71,7 +72,7 @@ def test_a_label_has_the_color_of_its_track():
 
 @given(PRESENCE)
 def test_tracks_that_share_a_row_do_not_overlap(frames):
-    tracks = log_of(frames).histories()
+    tracks = track_histories(table_of(frames))
     rows = _assign_rows(tracks, TimeAxis(max(len(frames), 1), 25.0))
     for (one, row), (other, same) in combinations(zip(tracks, rows), 2):
         assert row != same or one.last < other.first

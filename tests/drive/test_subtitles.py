@@ -9,7 +9,7 @@ import pytest
 
 from tests.drawing.cases import track
 from tests.video.clips import write_clip
-from vehicle_detection import Event, InvalidInputError, OwnSpeed, TrackLog, write_subtitles
+from vehicle_detection import Event, InvalidInputError, OwnSpeed, TrackTable, write_subtitles
 from vehicle_detection.video.ffmpeg import ffmpeg_binary
 
 EVENT = Event(
@@ -20,13 +20,13 @@ EVENT = Event(
 
 def drive(seconds=6, fps=10, *, first_time=0.0, **changes):
     """Log of a vehicle from second 1 to 4, and of a farther one from second 3 on."""
-    log = TrackLog()
+    table = TrackTable()
     for frame in range(round(seconds * fps)):
         time = frame / fps
         tracks = [track(id=1, distance_m=20.0, **changes)] if 1 <= time < 4 else []
         tracks += [track(id=2, distance_m=50.0, distance_std_m=20.0)] if time >= 3 else []
-        log.add(frame, first_time + time, tracks)
-    return log
+        table.append(frame, first_time + time, tracks)
+    return table
 
 
 def read_cues(path):
@@ -79,8 +79,8 @@ def test_oncoming_vehicles_and_unknown_values(tmp_path):
     )
     write_subtitles(drive(speed_std_mps=9.0), path, fps=10)
     assert read_cues(path)["00:00:01,000 --> 00:00:03,000"] == ["1 vehicle, nearest #1: 20 m"]
-    unknown = TrackLog()
-    unknown.add(0, None, [dataclasses.replace(track(), distance_m=None)])
+    unknown = TrackTable()
+    unknown.append(0, None, [dataclasses.replace(track(), distance_m=None)])
     write_subtitles(unknown, path, fps=10)
     assert list(read_cues(path).values()) == [["1 vehicle"]]
 
@@ -99,17 +99,17 @@ def test_players_read_both_formats(tmp_path, suffix):
 
 
 def test_an_empty_video_has_no_subtitles(tmp_path):
-    assert write_subtitles(TrackLog(), tmp_path / "found.srt", fps=25) == 0
+    assert write_subtitles(TrackTable(), tmp_path / "found.srt", fps=25) == 0
     assert (tmp_path / "found.srt").read_text() == ""
 
 
 def test_long_times(tmp_path):
-    log = TrackLog()
+    table = TrackTable()
     for frame in range(3700):
-        log.add(frame, float(frame), [])
-    write_subtitles(log, tmp_path / "a.srt", fps=1)
+        table.append(frame, float(frame), [])
+    write_subtitles(table, tmp_path / "a.srt", fps=1)
     assert "--> 01:01:40,000" in (tmp_path / "a.srt").read_text()
-    write_subtitles(log, tmp_path / "a.ass", fps=1)
+    write_subtitles(table, tmp_path / "a.ass", fps=1)
     assert "Dialogue: 0,0:00:00.00,1:01:40.00,Default,,0,0,0,,no vehicle" in (tmp_path / "a.ass").read_text()
 
 
@@ -118,7 +118,7 @@ def test_long_times(tmp_path):
     [
         ({"path": "found.txt"}, r"path must end in .srt or .ass, got 'found.txt'; write 'found.srt'"),
         ({"path": "none/found.srt"}, "path needs an existing folder"),
-        ({"log": []}, "log must be a TrackLog"),
+        ({"table": []}, "table must be a TrackTable"),
         ({"fps": 0}, "fps must be a number, greater than 0"),
         ({"own_speed": 25.0}, "own_speed must be an OwnSpeed, got 25.0; pass what read_own_speed returns"),
         ({"events": [1]}, "events must be an Event"),
@@ -126,17 +126,17 @@ def test_long_times(tmp_path):
     ],
 )
 def test_bad_arguments_are_refused(changes, message, tmp_path):
-    options = {"log": TrackLog(), "path": "found.srt", "fps": 25} | changes
+    options = {"table": TrackTable(), "path": "found.srt", "fps": 25} | changes
     with pytest.raises(InvalidInputError, match=message):
-        write_subtitles(options.pop("log"), tmp_path / options.pop("path"), **options)
+        write_subtitles(options.pop("table"), tmp_path / options.pop("path"), **options)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_frame_is_shown_until_the_next_one(tmp_path):
-    log = TrackLog()
+    table = TrackTable()
     for frame in range(3):
-        log.add(frame, frame * 2.0, [track(id=1, distance_m=20.0)])
-    write_subtitles(log, tmp_path / "found.srt", fps=0.5)
+        table.append(frame, frame * 2.0, [track(id=1, distance_m=20.0)])
+    write_subtitles(table, tmp_path / "found.srt", fps=0.5)
     assert read_cues(tmp_path / "found.srt") == {
         "00:00:00,000 --> 00:00:06,000": ["1 vehicle, nearest #1: 20 m, -6 km/h relative"]
     }

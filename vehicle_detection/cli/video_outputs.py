@@ -15,7 +15,8 @@ from vehicle_detection.errors import InvalidInputError
 if TYPE_CHECKING:
     from vehicle_detection.cli.video_options import VideoOptions
     from vehicle_detection.detector import VehicleDetector
-    from vehicle_detection.drive import Event, OwnSpeed, ReportWriter, TrackLog, TrackPicture
+    from vehicle_detection.drive import Event, OwnSpeed, ReportWriter, TrackPicture
+    from vehicle_detection.tables import TrackTable
     from vehicle_detection.video import FrameSource, VideoReport
 
 # Fraction of the frames without a known own speed from which on a warning is printed.
@@ -55,7 +56,7 @@ class SideOutputs:
 
         self._options = options
         self._page: ReportWriter | None = None
-        self._log: TrackLog
+        self._table: TrackTable
         self._events: tuple[Event, ...] = ()
         if options.events is not None:
             check_suffix(options.events, "--events", EVENT_SUFFIXES)
@@ -74,8 +75,9 @@ class SideOutputs:
         self, source: FrameSource, detector: VehicleDetector
     ) -> Iterator[list[Callable[[Any], object]]]:
         """Yield functions that take each frame's result; the file of tracks is complete after the block."""
-        from vehicle_detection.drive import ReportWriter, TrackLog
+        from vehicle_detection.drive import ReportWriter
         from vehicle_detection.export import TrackWriter
+        from vehicle_detection.tables import TrackTable
 
         options = self._options
         writers: list[Callable[[Any], object]] = []
@@ -88,11 +90,11 @@ class SideOutputs:
                     detector=detector,
                     units=detector.draw_params.units,
                 )
-        self._log = self._page.log if self._page else TrackLog()
+        self._table = self._page.table if self._page else TrackTable()
         # A camera that never ends would fill the memory with tracks that nobody asked for.
         wanted = options.report, options.events, options.clips, options.srt
         if not options.quiet or any(path is not None for path in wanted):
-            writers.append(self._page or self._log)
+            writers.append(self._table.append)
         with contextlib.ExitStack() as stack:
             if options.tracks is not None:
                 with option_names(path="--tracks"):
@@ -104,7 +106,7 @@ class SideOutputs:
         """Find the events, and write all files but that of the tracks."""
         from vehicle_detection.drive import cut_clips, write_events, write_subtitles
 
-        options, fps, log = self._options, float(done.fps), self._log
+        options, fps, table = self._options, float(done.fps), self._table
         events = self._events = self._find_events(done, detector)
         if options.events is not None:
             with option_names(path="--events"):
@@ -113,7 +115,7 @@ class SideOutputs:
             units = detector.draw_params.units
             with option_names(path="--srt"):
                 write_subtitles(
-                    log, options.srt, fps=fps, events=events, own_speed=detector.own_speed, units=units
+                    table, options.srt, fps=fps, events=events, own_speed=detector.own_speed, units=units
                 )
         if self._page is not None:
             pictures = self._explain(detector) if options.why else []
@@ -127,11 +129,11 @@ class SideOutputs:
         """Find the events of a processed video, and warn if the own speed is unknown for a part of it."""
         import numpy as np
 
-        from vehicle_detection.drive import find_events
+        from vehicle_detection.drive import find_events, own_speeds
 
-        log, fps, speeds = self._log, float(done.fps), None
+        table, fps, speeds = self._table, float(done.fps), None
         if detector.own_speed is not None:
-            speeds = log.own_speeds(detector.own_speed, fps)
+            speeds = own_speeds(detector.own_speed, table, fps=fps)
             unknown = float(np.isnan(speeds).mean()) if len(speeds) else 0.0
             if unknown > _MAX_UNKNOWN and not self._options.quiet:
                 print_error(
@@ -139,22 +141,22 @@ class SideOutputs:
                     "--gpx-offset, and that the file has no gaps of over 5 s"
                 )
         camera = detector.camera_of(done.shape)
-        return find_events(log, fps=fps, shape=done.shape, camera=camera, own_speed_mps=speeds)
+        return find_events(table, fps=fps, shape=done.shape, camera=camera, own_speed_mps=speeds)
 
     def _explain(self, detector: VehicleDetector) -> list[TrackPicture]:
         """Explain a box of each vehicle, for the report."""
         from vehicle_detection.drive import explain_tracks
 
         with self._options.open_source() as source:
-            return explain_tracks(detector, source, self._log)
+            return explain_tracks(detector, source, self._table)
 
     def print_summary(self, done: VideoReport) -> None:
         """Print the counts of a drive in one line, and the number of events of each other kind in another."""
         from vehicle_detection.drive import COUNTED, KINDS, count_vehicles
 
-        if not len(self._log.counts):
+        if not len(self._table.frame_keys):
             return
-        print_line(count_vehicles(self._events, self._log, fps=float(done.fps)).summary())
+        print_line(count_vehicles(self._events, self._table, fps=float(done.fps)).summary())
         kinds = Counter(event.kind for event in self._events if event.kind not in COUNTED)
         if kinds:
             listed = ", ".join(f"{kinds[kind]} {KINDS[kind]}" for kind in KINDS if kinds[kind])

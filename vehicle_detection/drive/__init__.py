@@ -7,8 +7,7 @@ from vehicle_detection.drive.dask_cluster import open_dask
 from vehicle_detection.drive.event_files import EVENT_SUFFIXES, cut_clips, write_events
 from vehicle_detection.drive.events import EVENT_COLUMNS, KINDS, Event, find_events
 from vehicle_detection.drive.explained_tracks import explain_tracks
-from vehicle_detection.drive.history import TrackLog
-from vehicle_detection.drive.own_speed import OwnSpeed, read_own_speed
+from vehicle_detection.drive.own_speed import OwnSpeed, own_speeds, read_own_speed
 from vehicle_detection.drive.report import ReportWriter
 from vehicle_detection.drive.report_page import TrackPicture
 from vehicle_detection.drive.subtitles import SUBTITLE_SUFFIXES, write_subtitles
@@ -26,7 +25,6 @@ __all__ = [
     "MinuteCounts",
     "OwnSpeed",
     "ReportWriter",
-    "TrackLog",
     "TrackPicture",
     "Trip",
     "VehicleCounts",
@@ -39,6 +37,7 @@ __all__ = [
     "find_trips",
     "open_dask",
     "open_trip",
+    "own_speeds",
     "read_own_speed",
     "run_batch",
     "with_source",

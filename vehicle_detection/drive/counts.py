@@ -9,11 +9,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-import numpy as np
-
 from vehicle_detection._common import check_number, check_type, pluralize
 from vehicle_detection.drive.events import Event, Kind, check_events
-from vehicle_detection.drive.history import TrackLog
+from vehicle_detection.tables import TrackTable
 
 COUNTED: tuple[Kind, ...] = ("met", "overtaken", "overtaking", "passed")
 """Kinds of events that are counted."""
@@ -68,13 +66,13 @@ class VehicleCounts:
         return f"{counts}; {total.mean_in_view:.1f} vehicles in view on average, {total.max_in_view} at most"
 
 
-def count_vehicles(events: Iterable[Event], log: TrackLog, *, fps: float) -> VehicleCounts:
+def count_vehicles(events: Iterable[Event], table: TrackTable, *, fps: float) -> VehicleCounts:
     """Count the vehicles of a drive.
 
     Parameters
     ----------
-    events, log
-        What `find_events` found, and the `TrackLog` that it was given.
+    events, table
+        What `find_events` found, and the tracks that it was given.
     fps
         Frame rate.
 
@@ -90,25 +88,25 @@ def count_vehicles(events: Iterable[Event], log: TrackLog, *, fps: float) -> Veh
 
     Examples
     --------
-    >>> from vehicle_detection import Event
-    >>> log = TrackLog()
+    >>> from vehicle_detection import Event, TrackTable
+    >>> table = TrackTable()
     >>> for frame in range(3000):
-    ...     log.add(frame, None, [])
+    ...     table.append(frame)
     >>> event = Event(kind="met", track_id=1, frame=1600, start_frame=1580, end_frame=1600, time_s=64.0)
-    >>> counts = count_vehicles([event], log, fps=25)
+    >>> counts = count_vehicles([event], table, fps=25)
     >>> [minute.met for minute in counts.minutes]
     [0, 1]
     >>> print(counts.summary())
     overtook 0 vehicles, was overtaken by 0, met 1 oncoming; 0.0 vehicles in view on average, 0 at most
     """
     rate = check_number(fps, "fps", above=0, high=1e6)
-    check_type(log, "log", TrackLog, "pass the TrackLog of the video")
+    check_type(table, "table", TrackTable, "pass the tracks of the video")
     listed = check_events(events)
-    frames = np.array(log.counts, np.int64)
+    frames = table.counts()
     minutes = range(math.ceil(len(frames) / rate / 60 - 1e-9))
     edges = [min(round(number * 60 * rate), len(frames)) for number in (*minutes, len(minutes))]
     return VehicleCounts(
-        vehicles=len(log.histories()),
+        vehicles=len(table.by_track()),
         total=_count(listed, frames, 0, len(frames), rate),
         minutes=tuple(_count(listed, frames, *pair, rate) for pair in pairwise(edges)),
     )

@@ -22,9 +22,10 @@ from vehicle_detection._common import (
     describe,
 )
 from vehicle_detection.camera import Camera
-from vehicle_detection.drive.history import TrackHistory, TrackLog, split_runs
+from vehicle_detection.drive.history import split_runs, track_histories
 from vehicle_detection.drive.motion import LANE_HALF_WIDTH_M, Bools, Motion, estimate_motion
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tables import TrackTable
 
 Kind = Literal[
     "headway",
@@ -177,7 +178,7 @@ def check_events(events: object) -> list[Event]:
 
 
 def find_events(
-    log: TrackLog | Iterable[TrackHistory],
+    table: TrackTable,
     *,
     fps: float,
     shape: tuple[int, ...],
@@ -191,8 +192,8 @@ def find_events(
 
     Parameters
     ----------
-    log
-        The tracks that a `TrackLog` collected, or its histories.
+    table
+        The tracks of the video.
     fps, shape
         Frame rate, and ``(height, width, ...)`` of the frames.
     camera
@@ -218,13 +219,13 @@ def find_events(
 
     Examples
     --------
-    >>> from vehicle_detection import Detections, Tracker
-    >>> tracker, log = Tracker(fps=25), TrackLog()
+    >>> from vehicle_detection import Detections, Tracker, TrackTable
+    >>> tracker, table = Tracker(fps=25), TrackTable()
     >>> for frame in range(75):  # a car that is nearer by 10 m every second
     ...     size = 1155 / (45 - 0.4 * frame)
     ...     box = [640 - 0.9 * size, 420 - 0.3 * size, 640 + 0.9 * size, 420 + 1.2 * size]
-    ...     log.add(frame, frame / 25, tracker.update(Detections([box], [2.0]), (720, 1280, 3)))
-    >>> [event.kind for event in find_events(log, fps=25, shape=(720, 1280, 3))]
+    ...     table.append(frame, frame / 25, tracker.update(Detections([box], [2.0]), (720, 1280, 3)))
+    >>> [event.kind for event in find_events(table, fps=25, shape=(720, 1280, 3))]
     ['hard_closing', 'headway']
     """
     rate = check_number(fps, "fps", above=0, high=1e6)
@@ -233,9 +234,8 @@ def find_events(
         camera = Camera.for_frame(frame_shape)
     check_type(camera, "camera", Camera, "omit it for a typical dash-cam")
     camera = camera.for_shape(frame_shape)
-    histories = log.histories() if isinstance(log, TrackLog) else check_sequence(log, "log", "TrackHistory")
-    for each in histories:
-        check_type(each, "log", TrackHistory, "pass a TrackLog, or what its histories() returns")
+    check_type(table, "table", TrackTable, "append the results of process_video to one")
+    histories = track_histories(table)
     length = max((track.last + 1 for track in histories), default=0)
     own_speed = _check_speed(own_speed_mps, length)
     motions = [

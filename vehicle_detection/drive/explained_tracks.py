@@ -10,9 +10,10 @@ from vehicle_detection.boxes import box_areas
 from vehicle_detection.camera import truncated_edges
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import blur_boxes, draw_boxes, draw_cell_shares
-from vehicle_detection.drive.history import TrackLog
+from vehicle_detection.drive.history import track_histories
 from vehicle_detection.drive.report_page import TrackPicture
 from vehicle_detection.explanation import Explanation, explain
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.video import Source, borrow_source
 
 # Part of an image around a window that a picture shows, as a fraction of its longer side; height of the
@@ -22,12 +23,12 @@ _AROUND, _PICTURE_HEIGHT, _BOX_COLOR = 0.2, 180, (240, 228, 66)
 _MAX_EXPLAINED = 12
 
 
-def explain_tracks(detector: VehicleDetector, source: Source, log: TrackLog) -> list[TrackPicture]:
+def explain_tracks(detector: VehicleDetector, source: Source, table: TrackTable) -> list[TrackPicture]:
     """Explain a box of each of the twelve longest tracks: the largest detected one inside the frame.
 
     Parameters
     ----------
-    detector, source, log
+    detector, source, table
         The detector, a source that can be read again, and the tracks of its frames.
 
     Returns
@@ -42,13 +43,13 @@ def explain_tracks(detector: VehicleDetector, source: Source, log: TrackLog) -> 
     VideoError
         If the source cannot be read.
     """
-    known = [track for track in log.histories() if np.isfinite(track.boxes).all(axis=1).any()]
+    known = [track for track in track_histories(table) if np.isfinite(track.boxes).all(axis=1).any()]
     tracks = sorted(known, key=lambda track: -len(track.frames))[:_MAX_EXPLAINED]
     pictures = []
     with borrow_source(source) as opened:
         shape = opened.info.shape[:2]
         fps = float(opened.info.fps)
-        offset, interval = round((log.first_time or 0.0) * fps), detector.search_interval(fps)
+        offset, interval = round((table.first_time or 0.0) * fps), detector.search_interval(fps)
         for track in tracks:
             truncated = truncated_edges(track.boxes, shape).any(axis=1)
             # Predicted boxes have no detection to explain; they are the last choice.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-from xml.parsers import expat
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,6 +29,7 @@ from vehicle_detection._common import (
     store_number,
 )
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tables import TrackTable
 
 # Gap (s) between two values from which on the speed between them is unknown.
 _MAX_GAP = 5.0
@@ -121,6 +122,27 @@ class OwnSpeed:
         return speeds
 
 
+def own_speeds(speed: OwnSpeed, table: TrackTable, *, fps: float) -> Floats:
+    """Speed of the own vehicle in each frame of a video.
+
+    Parameters
+    ----------
+    speed, table
+        Speed over the time of the source, and the tracks of its frames.
+    fps
+        Frame rate, for frames that were added without a time.
+
+    Returns
+    -------
+    numpy.ndarray
+        One value in m/s for each frame from 0 to the last one; NaN where the speed is unknown.
+    """
+    times = table.times()
+    if times is None:
+        times = (table.first_time or 0.0) + np.arange(len(table.counts())) / fps
+    return speed.at(times)
+
+
 def read_own_speed(path: str | os.PathLike[str], *, offset: float = 0.0) -> OwnSpeed:
     r"""Read the speed of the camera's own vehicle.
 
@@ -208,78 +230,27 @@ def _read_csv(data: bytes, name: str) -> tuple[Floats, Floats]:
     return times, speeds
 
 
-@dataclass
-class _TrackPoint:
-    """Point of a GPX track; what is unknown is NaN."""
+class _NoDoctype(ElementTree.TreeBuilder):
+    """Refuses a document type, whose entities can expand to any size; GPX needs none."""
 
-    latitude: float
-    longitude: float
-    time: float = math.nan
-    speed: float = math.nan
-
-
-class _GpxParser:
-    """Collects the points of all tracks of a GPX document, whose elements may have any namespace."""
-
-    def __init__(self) -> None:
-        self.points: list[_TrackPoint] = []
-        self._point: _TrackPoint | None = None
-        self._text: list[str] | None = None
-        self._parser = expat.ParserCreate()
-        self._parser.StartDoctypeDeclHandler = self._refuse_doctype
-        self._parser.StartElementHandler = self._start
-        self._parser.EndElementHandler = self._end
-        self._parser.CharacterDataHandler = self._add_text
-
-    def parse(self, data: bytes) -> None:
-        self._parser.Parse(data, True)
-
-    def _refuse_doctype(self, *_: Any) -> None:
+    def doctype(self, *_: Any) -> None:
         raise InvalidInputError("it has a document type declaration, which GPX does not need; remove it")
 
-    def _start(self, tag: str, attributes: dict[str, str]) -> None:
-        name = tag.rpartition(":")[2]
-        if name == "trkpt":
-            position = _parse_float(attributes.get("lat"), 90), _parse_float(attributes.get("lon"), 180)
-            self._point = _TrackPoint(*position)
-        elif self._point is not None and name in ("time", "speed"):
-            self._text = []
 
-    def _add_text(self, text: str) -> None:
-        if self._text is not None:
-            self._text.append(text)
-
-    def _end(self, tag: str) -> None:
-        name = tag.rpartition(":")[2]
-        point, text = self._point, self._text
-        if name == "trkpt" and point is not None:
-            if math.isfinite(point.time):
-                self.points.append(point)
-            self._point = None
-        elif point is not None and text is not None and name in ("time", "speed"):
-            joined = "".join(text).strip()
-            if name == "time":
-                point.time = _parse_time(joined)
-            else:
-                point.speed = _parse_float(joined, _MAX_SPEED)
-                point.speed = point.speed if point.speed >= 0 else math.nan
-            self._text = None
-
-
-def _parse_float(text: str | None, limit: float) -> float:
-    """Return a number of at most this absolute value; NaN for anything else."""
+def _parse_float(text: str | None, low: float, high: float) -> float:
+    """Return a number in this range; NaN for anything else."""
     try:
         value = float(text or "nan")
     except ValueError:
         return math.nan
-    return value if abs(value) <= limit else math.nan
+    return value if low <= value <= high else math.nan
 
 
 def _parse_time(text: str) -> float:
     """Return an ISO 8601 time as seconds since 1970; NaN for anything else. Without a zone it is UTC."""
     # Python 3.11 accepts up to 6 decimals, but any number is allowed.
     try:
-        time = datetime.fromisoformat(re.sub(r"(\.\d{6})\d+", r"\1", text))
+        time = datetime.fromisoformat(re.sub(r"(\.\d{6})\d+", r"\1", text.strip()))
         return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
     except (ValueError, OverflowError):
         return math.nan
@@ -287,16 +258,25 @@ def _parse_time(text: str) -> float:
 
 def _read_gpx(data: bytes, name: str) -> tuple[Floats, Floats]:
     """Read times (s) since the first point, and speeds (m/s), of the points of a GPX document."""
-    parser = _GpxParser()
+    parser = ElementTree.XMLParser(target=_NoDoctype())
     try:
-        parser.parse(data)
-    except expat.ExpatError as error:
+        parser.feed(data)
+        document = parser.close()
+    except ElementTree.ParseError as error:
         raise InvalidInputError(f"path {name} is no GPX file: {error}; export it again") from None
     except InvalidInputError as error:
         raise InvalidInputError(f"path {name} is refused: {error}") from None
-    points = np.array(
-        [(each.time, each.speed, each.latitude, each.longitude) for each in parser.points]
-    ).reshape(-1, 4)
+    # GPX 1.0 and 1.1 have different namespaces; the speed of version 1.1 is in an extension.
+    rows = [
+        (
+            _parse_time(point.findtext(".//{*}time") or ""),
+            _parse_float(point.findtext(".//{*}speed"), 0, _MAX_SPEED),
+            _parse_float(point.get("lat"), -90, 90),
+            _parse_float(point.get("lon"), -180, 180),
+        )
+        for point in document.iterfind(".//{*}trkpt")
+    ]
+    points = np.array([row for row in rows if math.isfinite(row[0])]).reshape(-1, 4)
     points = points[np.argsort(points[:, 0], kind="stable")]
     points = points[np.diff(points[:, 0], prepend=-np.inf) > 0]
     if len(points) < 2:

@@ -22,9 +22,10 @@ from vehicle_detection._common import (
     is_url,
 )
 from vehicle_detection.drive.events import Event, check_events, find_events
-from vehicle_detection.drive.history import TrackLog
+from vehicle_detection.drive.own_speed import own_speeds
 from vehicle_detection.drive.report_page import TrackPicture, VideoEmbed, render_page
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.video import VideoReport
 
 
@@ -47,8 +48,8 @@ class ReportWriter:
 
     Attributes
     ----------
-    log
-        `TrackLog` of the frames that were added.
+    table
+        `TrackTable` of the frames that were added.
 
     Raises
     ------
@@ -91,26 +92,11 @@ class ReportWriter:
         self._source_path = None if source is None else str(Path(os.fspath(source)))
         self._detector = detector
         self._embed_limit = check_integer(embed_limit, "embed_limit", low=0)
-        self.log = TrackLog()
+        self.table = TrackTable()
 
     def __call__(self, result: Any) -> None:
         """Add one frame's result: for ``process_video(..., on_result=...)``."""
-        self.write(result.index, result.time, result.tracks)
-
-    def write(self, index: int, time: float | None, tracks: Iterable[Any]) -> None:
-        """Add the shown tracks of the next frame.
-
-        Parameters
-        ----------
-        index, time, tracks
-            As in `TrackLog.add`.
-
-        Raises
-        ------
-        InvalidInputError
-            As in `TrackLog.add`.
-        """
-        self.log.add(index, time, tracks)
+        self.table.append(result)
 
     def finish(
         self,
@@ -126,7 +112,7 @@ class ReportWriter:
         report
             What `process_video` returned.
         events
-            What `find_events` found in `log`; None: they are found here.
+            What `find_events` found in `table`; None: they are found here.
         pictures
             `TrackPicture` objects to list below the tracks.
 
@@ -142,8 +128,8 @@ class ReportWriter:
             camera_of = getattr(self._detector, "camera_of", lambda shape: None)
             camera, fps = camera_of(report.shape), float(report.fps)
             own = getattr(self._detector, "own_speed", None)
-            speeds = None if own is None else self.log.own_speeds(own, fps)
-            events = find_events(self.log, fps=fps, shape=report.shape, camera=camera, own_speed_mps=speeds)
+            speeds = None if own is None else own_speeds(own, self.table, fps=fps)
+            events = find_events(self.table, fps=fps, shape=report.shape, camera=camera, own_speed_mps=speeds)
         listed = check_sequence(pictures, "pictures", "TrackPicture")
         for picture in listed:
             check_type(picture, "pictures", TrackPicture, "omit them, or pass TrackPicture objects")
@@ -158,7 +144,7 @@ class ReportWriter:
         if self._source_path and self._source:  # without its folder, as in the title
             damage = report.damage.replace(self._source_path, self._source)
             report = dataclasses.replace(report, damage=damage)
-        pieces = render_page(self.log, report, **options)
+        pieces = render_page(self.table, report, **options)
         with (
             atomic_write(self._path, "path") as part,
             # A file name may hold bytes that are not UTF-8; they become question marks.

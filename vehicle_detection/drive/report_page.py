@@ -22,7 +22,7 @@ from vehicle_detection._common import ROUGH_DISTANCE, UNITS, Floats, Units, form
 from vehicle_detection.annotator import MAX_SPEED_STD
 from vehicle_detection.drive.counts import VehicleCounts, count_vehicles
 from vehicle_detection.drive.events import KINDS, Event
-from vehicle_detection.drive.history import TrackHistory, TrackLog, bin_means
+from vehicle_detection.drive.history import TrackHistory, bin_means, track_histories
 from vehicle_detection.drive.report_charts import (
     TimeAxis,
     ValueAxis,
@@ -36,6 +36,7 @@ from vehicle_detection.drive.report_charts import (
 )
 from vehicle_detection.drive.report_formatting import format_time, format_value
 from vehicle_detection.heatmap import HeatParams
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.training import split_table
 from vehicle_detection.video import VideoReport
 
@@ -102,7 +103,7 @@ class Group(NamedTuple):
 
 
 def render_page(
-    log: TrackLog,
+    table: TrackTable,
     report: VideoReport,
     *,
     events: Sequence[Event],
@@ -115,11 +116,11 @@ def render_page(
     """Render the page in pieces; `detector` may lack settings or a model, which are then left out."""
     from jinja2 import Environment, StrictUndefined
 
-    axis = TimeAxis(max(report.frames, len(log.counts), 1), float(report.fps))
+    axis = TimeAxis(max(report.frames, len(table.counts()), 1), float(report.fps))
     chosen = UNITS[units]
     # Labels in the video state speeds over ground where the own speed is known.
     relative = " relative" if getattr(detector, "own_speed", None) is not None else ""
-    tracks = [_in_units(_without_imprecise_speeds(track), chosen) for track in log.histories()]
+    tracks = [_in_units(_without_imprecise_speeds(track), chosen) for track in track_histories(table)]
     css, script, template = map(_read, ("report.css", "report.js", "report.html.j2"))
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -133,17 +134,17 @@ def render_page(
         source=source,
         report=report,
         fps=axis.fps,
-        first_time=log.first_time,
+        first_time=table.first_time,
         units=chosen,
         notices=_notices(tracks, report, detector),
-        counts=_counts(tracks, log, report, chosen),
+        counts=_counts(tracks, table, report, chosen),
         video=video,
         tracks=tracks,
-        figures=_figures(tracks, log, events, axis, chosen) if tracks else [],
+        figures=_figures(tracks, table, events, axis, chosen) if tracks else [],
         events=events,
         event_kinds=KINDS,
         pictures=pictures,
-        minutes=_minute_table(count_vehicles(events, log, fps=axis.fps), axis.fps) if tracks else None,
+        minutes=_minute_table(count_vehicles(events, table, fps=axis.fps), axis.fps) if tracks else None,
         fraction_bar=fraction_bar,
         settings=_settings(detector, report.shape),
         model=_model_summary(getattr(detector, "model", None)),
@@ -183,13 +184,13 @@ def _notices(tracks: Sequence[TrackHistory], report: VideoReport, detector: Any)
 
 
 def _counts(
-    tracks: Sequence[TrackHistory], log: TrackLog, report: VideoReport, units: Units
+    tracks: Sequence[TrackHistory], table: TrackTable, report: VideoReport, units: Units
 ) -> dict[str, str]:
     fps = float(report.fps)
     counts = {"Vehicles": f"{len(tracks):,}", "Frames": f"{report.frames:,}"}
     counts |= {
-        "Length": format_time(max(report.frames, len(log.counts)) / fps),
-        "Most at once": str(max(log.counts, default=0)),
+        "Length": format_time(max(report.frames, len(table.counts())) / fps),
+        "Most at once": str(table.counts().max(initial=0)),
     }
     if tracks:
         longest = max(tracks, key=lambda track: len(track.frames))
@@ -222,7 +223,7 @@ def _minute_table(counts: VehicleCounts, fps: float) -> Table:
 
 
 def _figures(
-    tracks: Sequence[TrackHistory], log: TrackLog, events: Sequence[Event], axis: TimeAxis, units: Units
+    tracks: Sequence[TrackHistory], table: TrackTable, events: Sequence[Event], axis: TimeAxis, units: Units
 ) -> list[Figure]:
     label = f"Bars of {pluralize(len(tracks), 'track')}: when each was shown, as in the table of tracks."
     distances = [track.columns["distance_m"] for track in tracks]
@@ -231,14 +232,14 @@ def _figures(
     return [
         Figure("Tracks", "When each vehicle was shown", gantt(tracks, axis, label=label)),
         *([Figure("Events", "What the table of events lists", marked)] if events else []),
-        _count_figure(log, axis),
+        _count_figure(table, axis),
         _curve_figure("distance", np.concatenate(distances), tracks, axis, units),
         _curve_figure("relative speed", np.concatenate(speeds), tracks, axis, units),
     ]
 
 
-def _count_figure(log: TrackLog, axis: TimeAxis) -> Figure:
-    counts = np.array(log.counts, np.int64)
+def _count_figure(table: TrackTable, axis: TimeAxis) -> Figure:
+    counts = table.counts()
     seconds = next((each for each in _COUNT_SECONDS if axis.seconds / each <= 300), 600)
     edges = [0.0]
     while edges[-1] < axis.frames:  # a frame belongs to the second in which it begins

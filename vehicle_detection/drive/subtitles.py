@@ -24,8 +24,9 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.annotator import MAX_SPEED_STD
 from vehicle_detection.drive.events import Event, check_events
-from vehicle_detection.drive.history import TrackHistory, TrackLog
-from vehicle_detection.drive.own_speed import OwnSpeed
+from vehicle_detection.drive.history import TrackHistory, track_histories
+from vehicle_detection.drive.own_speed import OwnSpeed, own_speeds
+from vehicle_detection.tables import TrackTable
 
 SUBTITLE_SUFFIXES = (".srt", ".ass")
 """Suffixes of files of subtitles."""
@@ -61,7 +62,7 @@ class _Nearest:
 
 
 def write_subtitles(
-    log: TrackLog,
+    table: TrackTable,
     path: str | os.PathLike[str],
     *,
     fps: float,
@@ -77,12 +78,12 @@ def write_subtitles(
 
     Parameters
     ----------
-    log, fps
-        The `TrackLog` of the video, and its frame rate.
+    table, fps
+        The tracks of the video, and its frame rate.
     path
         ``.srt`` (SubRip) or ``.ass`` (Advanced SubStation Alpha, in the upper left corner).
     events
-        What `find_events` found in `log`.
+        What `find_events` found in `table`.
     own_speed
         Speed of the camera's vehicle over the time of the source. Where it is known, speeds are those over
         ground; elsewhere they are relative to the camera.
@@ -103,11 +104,12 @@ def write_subtitles(
     --------
     >>> import tempfile
     >>> from pathlib import Path
-    >>> log = TrackLog()
+    >>> from vehicle_detection import OwnSpeed, TrackTable
+    >>> table = TrackTable()
     >>> for frame in range(50):
-    ...     log.add(frame, frame / 25, [])
+    ...     table.append(frame, frame / 25)
     >>> file = Path(tempfile.mkdtemp()) / "found.srt"
-    >>> write_subtitles(log, file, fps=25, own_speed=OwnSpeed.constant(25.0))
+    >>> write_subtitles(table, file, fps=25, own_speed=OwnSpeed.constant(25.0))
     1
     >>> print(file.read_text().rstrip())
     1
@@ -115,15 +117,15 @@ def write_subtitles(
     own speed 90 km/h
     no vehicle
     """
-    check_type(log, "log", TrackLog, "pass the one that process_video filled")
+    check_type(table, "table", TrackTable, "append the results of process_video to one")
     target = check_suffix(path, "path", SUBTITLE_SUFFIXES)
     rate = check_number(fps, "fps", above=0, high=1e6)
     if own_speed is not None:
         check_type(own_speed, "own_speed", OwnSpeed, "pass what read_own_speed returns")
     check_choice(units, "units", UNITS)
     listed = check_events(events)
-    cues = list(_merge(_second_texts(log, rate, listed, own_speed, UNITS[units])))
-    end = len(log.counts) / rate
+    cues = list(_merge(_second_texts(table, rate, listed, own_speed, UNITS[units])))
+    end = len(table.counts()) / rate
     with atomic_write(target, "path") as part, part.open("w", encoding="utf-8", newline="\n") as file:
         if target.suffix.lower() == ".ass":
             file.write(_ASS_HEADER)
@@ -139,15 +141,15 @@ def write_subtitles(
 
 
 def _second_texts(
-    log: TrackLog, fps: float, events: list[Event], own_speed: OwnSpeed | None, units: Units
+    table: TrackTable, fps: float, events: list[Event], own_speed: OwnSpeed | None, units: Units
 ) -> Iterator[tuple[str, ...]]:
     """Yield the lines for each second of a video."""
-    counts = np.array(log.counts, np.int64)
+    counts = table.counts()
     seconds = math.ceil(len(counts) / fps - 1e-9)
-    nearest = _nearest_tracks(log.histories(), fps)
+    nearest = _nearest_tracks(track_histories(table), fps)
     # In the middle of each second.
     frames = np.minimum((np.arange(seconds) + 0.5) * fps, len(counts) - 1).astype(np.intp)
-    own = np.full(seconds, np.nan) if own_speed is None else log.own_speeds(own_speed, fps)[frames]
+    own = np.full(seconds, np.nan) if own_speed is None else own_speeds(own_speed, table, fps=fps)[frames]
     shown: defaultdict[int, list[Event]] = defaultdict(list)
     for event in events:
         for second in range(int(event.time_s), int(event.time_s) + _EVENT_SECONDS):
