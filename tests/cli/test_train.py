@@ -115,10 +115,6 @@ def test_fetch_prints_the_paths_of_the_patches(monkeypatch, tmp_path):
     ]
 
 
-def test_fetch_refuses_a_file_as_its_folder(picture):
-    assert "--output must be a folder" in refuse("fetch", "-o", picture)
-
-
 def test_a_failed_fetch_leaves_no_folder(monkeypatch, tmp_path):
     def fail(output, progress):
         raise DatasetError("the server cannot\nbe reached")
@@ -158,11 +154,6 @@ def test_info_of_a_model_with_incomplete_scores(tmp_path):
     scores = info({"splits": {"random": {"accuracy": 0.5, "test": "x"}}})
     assert re.search(r"accuracy\s+─+\s+random fifth +0\.5000", scores)
     assert "random fifth" in info({"splits": {"random": {"accuracy": 10**400}}})
-
-
-def test_info_of_a_missing_model(material):
-    assert "model file motorway does not exist; check the path" in refuse("info", "motorway")
-    assert "is a folder; choose a file in it" in refuse("info", material / "empty")
 
 
 def test_info_of_a_model_with_other_metadata(tmp_path):
