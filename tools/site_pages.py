@@ -41,7 +41,7 @@ API_PAGES = (
     ("video", "Video and drawing", "video annotator drawing images"),
     ("drive", "Events, reports and batches", "drive"),
     ("tables", "Tables and files", "tables export"),
-    ("models", "Models and training", "loading network svm transformer training"),
+    ("models", "Models and training", "loading network svm training"),
     ("explain", "Explain and explore", "explanation notebook"),
     ("course_steps", "Features, windows and heat maps", "features windows search heatmap regions course"),
     ("evaluation", "Evaluation", "evaluation"),
