@@ -22,8 +22,9 @@ from vehicle_detection import (
     iou_matrix,
     render_drive,
 )
-from vehicle_detection.evaluation import FrameBoxes, TrackScores
+from vehicle_detection.evaluation import TrackScores
 from vehicle_detection.scenes import Drive, VehicleTruth
+from vehicle_detection.tables import TrackTable
 
 FRAMES = 200
 
@@ -109,12 +110,12 @@ def score_drive(drive: Drive, detector: VehicleDetector) -> DriveScores:
     results, detected = track_drive(drive, detector)
     truth = drive.truth
     labels = _label_boxes(truth)
-    shown = FrameBoxes.from_results(results)
+    shown = TrackTable.from_results(results)
     scores = None
-    if len(labels.frames):
+    if len(labels):
         scores = evaluate_tracks(shown, labels, iou=_IOU, frames=range(len(results)))
     ranges = match_ranges(truth, results)
-    return DriveScores(scores, ranges, tuple(_delays(truth, results, detected)), len(shown.frames))
+    return DriveScores(scores, ranges, tuple(_delays(truth, results, detected)), len(shown))
 
 
 def track_drive(drive: Drive, detector: VehicleDetector) -> tuple[list[FrameResult], list[int]]:
@@ -140,13 +141,13 @@ def track_drive(drive: Drive, detector: VehicleDetector) -> tuple[list[FrameResu
     return results + detector.interpolate(results[-1], None, [frame / fps for frame in rest]), searched
 
 
-def _label_boxes(truth: Sequence[Sequence[VehicleTruth]]) -> FrameBoxes:
+def _label_boxes(truth: Sequence[Sequence[VehicleTruth]]) -> TrackTable:
     """Boxes of all frames."""
     rows = [(frame, row) for frame, vehicles in enumerate(truth) for row in vehicles]
     boxes = np.array([row.box for _, row in rows], np.float64).reshape(-1, 4)
     ignored = np.array([bool(row.ignore) for _, row in rows], np.bool_)
     tracks = np.array([row.track for _, row in rows], np.int64)
-    return FrameBoxes([frame for frame, _ in rows], tracks, boxes, ignore=ignored)
+    return TrackTable([frame for frame, _ in rows], tracks, boxes, ignore=ignored)
 
 
 def match_ranges(

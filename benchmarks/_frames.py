@@ -16,7 +16,7 @@ from vehicle_detection import (
     process_video,
     read_labels,
 )
-from vehicle_detection.evaluation import FrameBoxes
+from vehicle_detection.tables import TrackTable
 
 
 def run(context: Context) -> list[Row]:
@@ -40,7 +40,7 @@ def run(context: Context) -> list[Row]:
 
 def _image_rows(model: str, folder: Path, labels: Path, material: str) -> list[Row]:
     with VehicleDetector(model) as detector:
-        found = FrameBoxes.from_detections(
+        found = TrackTable.from_detections(
             {name: detector.detect(image) for name, image in load_frames(folder)}
         )
     scores = evaluate_detections(found, read_labels(labels))
@@ -59,7 +59,7 @@ def _clip_rows(
     with VehicleDetector(model) as detector:
         process_video(source, None, detector, progress=False, on_result=results.append)
     scores = evaluate_tracks(
-        FrameBoxes.from_results(results), read_labels(labels), frames=range(len(results))
+        TrackTable.from_results(results), read_labels(labels), frames=range(len(results))
     )
     false_run, details = scores.longest_false_positive_run, scores.to_dict()
     return [

@@ -93,7 +93,7 @@ def each(kind: str, folder: str, out: str) -> dict[str, Any]:
     with vehicle_detection.VehicleDetector(n_jobs=1) as detector:
         for path in sorted(Path(folder).iterdir()):
             target = Path(out) / path.name
-            with vehicle_detection.TrackWriter(target.with_suffix(".parquet")) as write:
+            with vehicle_detection.open_tracks(target.with_suffix(".parquet")) as write:
                 done = vehicle_detection.process_video(
                     path,
                     target if kind == "videos" else None,

@@ -176,7 +176,7 @@ def _subsample(name: str, count: int) -> vd.LabelledFrames:
 def _label(name: str, rendered: Sequence[Any]) -> vd.LabelledFrames:
     """Combine rendered scenes and their true boxes."""
     rows = [(number, row) for number, scene in enumerate(rendered) for row in scene.truth]
-    labels = vd.FrameBoxes(
+    labels = vd.TrackTable(
         [number for number, _ in rows],
         np.array([row.track for _, row in rows], int),
         np.array([row.box for _, row in rows], float).reshape(-1, 4),
@@ -207,7 +207,7 @@ class Clip:
     path: Path
     horizon: float
     end: float
-    labels: vd.FrameBoxes
+    labels: vd.TrackTable
     truth: Any
 
 
@@ -217,7 +217,7 @@ def clip(folder: str | os.PathLike[str], frames: int = 50) -> Clip:
         labels = vd.read_labels(DATA / "labels" / "project_clip.csv")
         path = DATA / "videos" / "project_clip.mp4"
         fps = float(vd.probe_video(path).fps)
-        labels = labels[np.array(labels.frames) < frames]
+        labels = labels[labels["frame"] < frames]
         return Clip(path, 0.58, frames / fps, labels, labels)
     from moviepy import ImageSequenceClip
 

@@ -13,11 +13,12 @@ import numpy as np
 
 from tests.network.graphs import own_network
 from vehicle_detection.boxes import clip_boxes
-from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
+from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.images import write_image
 from vehicle_detection.network import load_network
 from vehicle_detection.scenes import render_scene
 from vehicle_detection.svm import Template, VehicleClassifier
+from vehicle_detection.tables import TrackTable
 
 ROOT = Path(__file__).parents[1]
 """Root of the repository."""
@@ -87,7 +88,7 @@ def drawn(seeds, name="road"):
             boxes.append(vehicle.box)
             ignore.append(bool(x2 - x1 < 28 or vehicle.occluded_fraction > 0.4 or vehicle.truncated > 0.4))
     return LabelledFrames(
-        name, [scene.image for scene in scenes], FrameBoxes(keys, None, boxes, ignore=ignore)
+        name, [scene.image for scene in scenes], TrackTable(keys, None, boxes, ignore=ignore)
     )
 
 
@@ -126,7 +127,7 @@ def write_frame_set(folder, name, frames, *, place="frames"):
     for key, image in frames:
         write_image(target / f"{key:03d}.png", image)
         part = frames.labels.frame(key)
-        for box, ignore in zip(part.boxes.tolist(), part.ignore.tolist()):
+        for box, ignore in zip(part.boxes.tolist(), part["ignore"].tolist()):
             lines.append(f"{key:03d}.png,-1,{','.join(map(str, box))},0,0,{int(ignore)}")
     (folder / "labels" / f"{name}.csv").write_text("\n".join(lines) + "\n")
 

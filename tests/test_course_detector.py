@@ -11,8 +11,10 @@ from tests.video.clips import write_clip
 from vehicle_detection.course import HeatmapDetector, extract_features, find_car_windows
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections, read_labels
+from vehicle_detection.evaluation import LabelledFrames, evaluate_detections
+from vehicle_detection.formats import read_labels
 from vehicle_detection.scenes import render_patches, render_scene
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.video import process_video
 
 FEATURES = {"spatial_size": (16, 16), "hist_bins": 16, "divide_by": 1}
@@ -131,7 +133,7 @@ def test_it_finds_all_vehicles_of_the_courses_images(real_data):
     labels = read_labels(real_data / "labels" / "test_images.csv")
     images = LabelledFrames("test images", load_frames(real_data / "test_images"), labels)
     with HeatmapDetector() as detector:
-        found = FrameBoxes.from_detections({key: detector.detect(image) for key, image in images})
+        found = TrackTable.from_detections({key: detector.detect(image) for key, image in images})
     scores = evaluate_detections(found, images.labels, frames=images.keys)
     assert (scores.tp, scores.fn, scores.fp) == (9, 0, 0)
 

@@ -20,8 +20,9 @@ from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drive import OwnSpeed
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections, read_labels
+from vehicle_detection.evaluation import LabelledFrames, evaluate_detections
 from vehicle_detection.features import FeatureParams
+from vehicle_detection.formats import read_labels
 from vehicle_detection.heatmap import HeatParams
 from vehicle_detection.loading import load_model
 from vehicle_detection.network import NetworkParams
@@ -29,6 +30,7 @@ from vehicle_detection.regions import RegionParams
 from vehicle_detection.scenes import SceneVehicle, render_drive, render_scene
 from vehicle_detection.search import SearchBand, SearchParams
 from vehicle_detection.svm import Template, VehicleClassifier
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.tracking import FrameResult, Tracker, TrackParams
 from vehicle_detection.video import process_video
 
@@ -692,7 +694,7 @@ def test_heat_finds_all_vehicles_of_the_courses_images(real_data, model, weighti
     labels = read_labels(real_data / "labels" / "test_images.csv")
     images = LabelledFrames("test images", load_frames(real_data / "test_images"), labels)
     with VehicleDetector(model, region_params=HeatParams(weighting=weighting)) as detector:
-        found = FrameBoxes.from_detections({key: detector.detect(image) for key, image in images})
+        found = TrackTable.from_detections({key: detector.detect(image) for key, image in images})
     scores = evaluate_detections(found, images.labels, frames=images.keys)
     assert (scores.tp, scores.fn, scores.fp) == (9, 0, 0)
 

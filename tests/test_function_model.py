@@ -14,10 +14,11 @@ from tests.video.clips import write_clip
 from vehicle_detection.boxes import Detections
 from vehicle_detection.detector import VehicleDetector, detector_from
 from vehicle_detection.errors import DetectorError, InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, evaluate_tracks
+from vehicle_detection.evaluation import evaluate_tracks
 from vehicle_detection.function_model import FunctionModel, FunctionParams
 from vehicle_detection.heatmap import HeatParams
 from vehicle_detection.notebook import Explorer
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.tracking import TrackParams
 from vehicle_detection.video import process_video
 
@@ -57,8 +58,8 @@ def test_a_function_detects_tracks_and_draws():
     assert found.scores.tolist() == pytest.approx([np.log(9)])
     assert len(detector.detect(frame_with())) == 0
     results = [detector.process(frame_with(moved(step)), step / 25) for step in range(12)]
-    truth = FrameBoxes(range(12), [1] * 12, [moved(step) for step in range(12)])
-    scores = evaluate_tracks(FrameBoxes.from_results(results), truth)
+    truth = TrackTable(range(12), [1] * 12, [moved(step) for step in range(12)])
+    scores = evaluate_tracks(TrackTable.from_results(results), truth)
     assert (scores.tp, scores.id_switches) == (12, 0)
     assert (detector.annotate(frame, results[-1]) != frame).any()
 

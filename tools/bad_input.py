@@ -197,8 +197,8 @@ class _Valid:
         patch_set = vd.PatchSet(patches, labels, names)
         params = vd.FeatureParams(hog_channel=0, spatial_feat=False, hist_feat=False, orient=4)
         classifier = vd.train_classifier(patches, labels, params=params)
-        truth = vd.FrameBoxes([0, 1], np.array([1, 1]), boxes)
-        predicted = vd.FrameBoxes([0, 1], np.array([1, 1]), boxes, scores=scores)
+        truth = vd.TrackTable([0, 1], np.array([1, 1]), boxes)
+        predicted = vd.TrackTable([0, 1], np.array([1, 1]), boxes, score=scores)
         frames = vd.LabelledFrames("a", {0: image, 1: image}, truth)
         camera = vd.Camera(focal_px=500.0, horizon_px=40.0)
         band = vd.SearchBand(window=(64, 64), y=(0.0, 256.0))
@@ -230,13 +230,13 @@ class _Valid:
                   "ystop": 96, "scale": 1.0}  # fmt: skip
         self.instances: dict[str, Any] = {
             "Camera": camera, "Detections": windows, "Explorer": vd.Explorer([image], classifier),
-            "FrameBoxes": predicted, "FunctionParams": vd.FunctionParams(), "HeatHistory": vd.HeatHistory(),
+            "TrackTable": predicted, "FunctionParams": vd.FunctionParams(), "HeatHistory": vd.HeatHistory(),
             "FrameSource": vd.open_source(clip), "HeatmapDetector": vd.HeatmapDetector(classifier),
             "NetworkModel": vd.load_model("default"), "NetworkParams": vd.NetworkParams(),
             "OwnSpeed": own_speed, "PatchFeatures": vd.PatchFeatures(n_jobs=1), "PatchSet": patch_set,
             "Platt": vd.Platt(-1.0, 0.0),
             "ReportWriter": vd.ReportWriter(folder / "writer.html"),
-            "SearchParams": search, "TrackTable": log,
+            "SearchParams": search,
             "Tracker": tracker, "VehicleClassifier": classifier, "VehicleDetector": detector,
         }  # fmt: skip
         self.by_name: dict[str, Any] = {
@@ -266,9 +266,9 @@ class _Valid:
             "course.": lesson,
             "LabelledFrames": {"frames": [image, image], "labels": truth},
             "LabelledFrames.from_video": {"path": clip, "labels": truth},
-            "FrameBoxes": {"frames": [0, 1], "tracks": np.array([1, 1])},
-            "FrameBoxes.from_detections": {"detections": {0: windows}},
-            "FrameBoxes.from_pandas": {"table": predicted.to_pandas()},
+            "TrackTable": {"frame": [0, 1], "track_id": np.array([1, 1])},
+            "TrackTable.from_detections": {"detections": {0: windows}},
+            "TrackTable.from_pandas": {"table": predicted.to_pandas()},
             "Detections.from_supervision": {"detections": theirs},
             "FrameDataset": {"sets": (frames,)},
             "Platt": {"a": -1.0, "b": 0.0},
@@ -348,12 +348,11 @@ class _Valid:
             "track": {"source": clip, "detector": detector},
             "train_and_evaluate": {"params": params, "seeds": 1, "n_jobs": 1},
             "train_classifier": {"labels": labels, "params": params, "n_jobs": 1},
-            "write_boxes": {"boxes": [("a.png", windows)]},
             "write_camera": {"path": folder / "out.json"},
             "write_image": {"path": folder / "out.png"},
             "write_labels": {"labels": truth},
             "write_subtitles": {"path": folder / "out.srt"},
-            "write_tracks": {"results": [(0, 1, 10, 20, 30, 40, 1.5)]},
+            "write_tracks": {"results": predicted},
             "notebook.plot_errors": {"frames": frames},
             "notebook.plot_explanation": {"explanation": vd.explain(detector, image, boxes[0])},
             "notebook.plot_f1": {"scores": {"a": scores_of}},

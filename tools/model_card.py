@@ -176,5 +176,5 @@ def _facts(model: NetworkModel, trained_on: str) -> list[str]:
 
 def _describe(source: FrameDataset) -> str:
     frames = sum(len(part) for part in source.sets)
-    vehicles = sum(int((~part.labels.ignore).sum()) for part in source.sets)
+    vehicles = sum(int((~part.labels["ignore"]).sum()) for part in source.sets)
     return f"{source.name}, {frames} frames, {vehicles} vehicles: {_DATA.get(source.name, 'no description')}"

@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from vehicle_detection.evaluation import read_labels
+from vehicle_detection.formats import read_labels
 
 _FIRST = 557
 """Rides at the beginning of the labels, half of which were picked for their content."""
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m tools.rides", description="Print the kept rides.")
     parser.add_argument("data", metavar="DATA", type=Path, help="data folder with labels/bdd.csv")
     options = parser.parse_args(arguments)
-    print("\n".join(kept_rides(read_labels(options.data / "labels" / "bdd.csv").frames)))
+    print("\n".join(kept_rides(read_labels(options.data / "labels" / "bdd.csv")["frame"])))
 
 
 if __name__ == "__main__":

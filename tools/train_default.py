@@ -71,7 +71,7 @@ def load_sources(folder: Path, *, held_out: bool = False) -> list[FrameDataset]:
     if not held_out:
         return [*(found[name] for name in (RIDES, *LEFT_OUT)), course]
     (rides,) = found[RIDES].sets
-    kept = set(kept_rides(rides.labels.frames))
+    kept = set(kept_rides(rides.labels["frame"]))
     return [FrameDataset(RIDES, (select_frames(rides, set(rides.keys) - kept),)), course]
 
 
@@ -81,7 +81,7 @@ def evaluate_held_out(
     """Detect vehicles with the network for the measurements in the frames that it has not seen."""
     rides, *sources = choose_sources(folder, (RIDES, *LEFT_OUT))
     (part,) = rides.sets
-    kept = FrameDataset(RIDES, (select_frames(part, set(kept_rides(part.labels.frames))),))
+    kept = FrameDataset(RIDES, (select_frames(part, set(kept_rides(part.labels["frame"]))),))
     return detect_logits(model, [kept, *sources], n_jobs=n_jobs)
 
 

@@ -63,7 +63,6 @@ from .errors import (
 )
 from .evaluation import (
     DetectionScores,
-    FrameBoxes,
     LabelledFrames,
     TrackScores,
     calibrate_scores,
@@ -71,11 +70,8 @@ from .evaluation import (
     evaluate_detections,
     evaluate_tracks,
     precision_recall_curve,
-    read_labels,
-    write_labels,
 )
 from .explanation import Explanation, explain
-from .export import TrackWriter, write_boxes, write_tracks
 from .features import (
     FeatureParams,
     bin_spatial,
@@ -86,6 +82,7 @@ from .features import (
     hog_image,
     single_img_features,
 )
+from .formats import open_tracks, read_labels, write_labels, write_tracks
 from .function_model import FunctionParams
 from .heatmap import HeatHistory, HeatParams, add_heat, apply_threshold, bounding_boxes, label_boxes
 from .images import read_image, write_image
@@ -142,7 +139,6 @@ __all__ = [
     "Explanation",
     "Explorer",
     "FeatureParams",
-    "FrameBoxes",
     "FrameDataset",
     "FrameResult",
     "FrameSet",
@@ -173,7 +169,6 @@ __all__ = [
     "TrackRun",
     "TrackScores",
     "TrackTable",
-    "TrackWriter",
     "Tracker",
     "TrainingOptions",
     "TrainingReport",
@@ -235,6 +230,7 @@ __all__ = [
     "notebook",
     "open_dask",
     "open_source",
+    "open_tracks",
     "open_trip",
     "pareto_front",
     "precision_recall_curve",
@@ -262,7 +258,6 @@ __all__ = [
     "track",
     "train_and_evaluate",
     "train_classifier",
-    "write_boxes",
     "write_camera",
     "write_events",
     "write_image",

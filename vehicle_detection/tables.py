@@ -49,8 +49,6 @@ LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autoricksha
 """Classes whose boxes are vehicles by default, and classes whose labels are ignored."""
 _CLASS_COLUMNS = ("class", "label", "category")
 
-FRAME_NUMBER = re.compile(r"-?(0|[1-9][0-9]*)(\.0*)?")
-"""Text of a frame that is a number. One with leading zeros is a file name."""
 _FLAGS = {"false": False, "true": True, "0": False, "1": True, "0.0": False, "1.0": True}
 # Distances and speeds beyond this are unknown.
 _ABSURD = 1e9
@@ -370,6 +368,12 @@ class TrackTable:
         """Select the boxes of one frame; empty for a frame without boxes."""
         return self._take(self.rows(key), (key,))
 
+    def select(self, keys: Iterable[FrameKey]) -> TrackTable:
+        """Select the boxes of some frames, which are all frames of the result."""
+        wanted = set(keys)
+        rows = [row for row, key in enumerate(self["frame"].tolist()) if key in wanted]
+        return self._take(np.array(rows, np.intp), sorted(wanted, key=frame_order))
+
     def __iter__(self) -> Iterator[tuple[FrameKey, TrackTable]]:
         return ((key, self.frame(key)) for key in self.frame_keys)
 
@@ -550,7 +554,8 @@ def parse_cells(
         found = shorten(", ".join(map(str, cells)), 300) or "an empty file"
         raise error(f"{source} lacks the columns {', '.join(missing)}; found {found}")
     keys = _parse_frames(cells["frame"], places, error)
-    predicted = not all(map(_is_missing, cells.get("score", ())))
+    scores = cells.get("score")
+    predicted = scores is not None and (not scores or not all(map(_is_missing, scores)))
     vehicles, lookalike = _vehicle_rows(cells, source, classes, predicted, error)
     rows = np.flatnonzero(vehicles).tolist()
     where = [places[row] for row in rows]
@@ -558,7 +563,7 @@ def parse_cells(
     for name in (*CORNERS, *_COLUMNS):
         used = "track" if name == "track_id" and name not in cells else name
         if used in cells and (name != "score" or predicted):
-            columns[name] = _parse_numbers(name, [cells[used][row] for row in rows], where, error)
+            columns[name] = _parse_numbers(used, [cells[used][row] for row in rows], where, error)
     if lookalike.any():
         columns["ignore"] = columns.get("ignore", False) | lookalike[rows]
     columns["boxes"] = np.stack([columns.pop(name) for name in CORNERS], axis=1)
@@ -574,11 +579,11 @@ def _parse_frames(cells: Sequence[Any], places: Sequence[str], error: type[Excep
     """Frames as numbers or names; whole numbers that a concatenation has made floats are numbers again."""
     keys: list[FrameKey] = []
     for cell, place in zip(cells, places, strict=True):
-        if _is_missing(cell):
+        if cell in (None, "") or cell != cell:  # NaN; a frame may be called "nan"
             raise error(f"{place}: frame is empty; enter its number from 0 or its file name")
         if isinstance(cell, str):
             keys.append(cell)
-        elif isinstance(cell, bool) or float(cell) < 0 or not float(cell).is_integer():
+        elif isinstance(cell, bool) or not 0 <= float(cell) <= _MAX_ID or cell != int(cell):
             raise error(f"{place}: frame must be a whole number from 0 or a name, got {describe(cell)}")
         else:
             keys.append(int(cell))
@@ -643,7 +648,7 @@ def _parse_numbers(
     name: str, cells: Sequence[Any], places: Sequence[str], error: type[Exception]
 ) -> NDArray[Any]:
     """Numbers of a column; a missing one, except for a corner or a score, is the usual one of the column."""
-    column = _COLUMNS.get(name, _Column(math.nan))
+    column = _COLUMNS.get("track_id" if name == "track" else name, _Column(math.nan))
     kind = type(column.missing)
     values = []
     for cell, place in zip(cells, places, strict=True):
@@ -656,6 +661,8 @@ def _parse_numbers(
                 raise error(f"{place}: {name} must be 0 or 1, got {describe(cell)}")
             values.append(flag)
             continue
+        if _is_missing(cell) and name == "score":
+            raise error(f"{place}: some boxes have a score and some have none; give all or none")
         value = parse_number(cell, name, place, error)
         if kind is int and value != int(value):
             raise error(f"{place}: {name} must be a whole number, got {describe(cell)}")

@@ -18,12 +18,13 @@ import pytest
 from tests.cli.commands import failing, finish, run, start_changed
 from tests.helpers import ROOT
 from tests.video.clips import gray_frames, write_clip
-from vehicle_detection import detector, drive, export, tables, video
+from vehicle_detection import detector, drive, tables, video
 from vehicle_detection._common import files
 from vehicle_detection._kernels.jit import jit
 from vehicle_detection.cli.signals import raise_on_signals
 from vehicle_detection.drive import event_files, events
 from vehicle_detection.errors import OutputError
+from vehicle_detection.formats import write
 from vehicle_detection.images import write_image
 from vehicle_detection.scenes import render_patches, render_scene
 from vehicle_detection.video import probe_video
@@ -252,7 +253,7 @@ def test_a_disk_that_is_full_while_tracks_are_written(clip, tmp_path, monkeypatc
     def fill(self, result):
         raise FULL
 
-    monkeypatch.setattr(export.TrackWriter, "__call__", fill)
+    monkeypatch.setattr(write.TrackStream, "__call__", fill)
     words = ["-o", tmp_path / "out.mp4", "--tracks", tmp_path / "out.csv", "--model", "highway"]
     result = run("video", clip, *words, "-q")
     assert result.exit_code == 2

@@ -24,7 +24,7 @@ from vehicle_detection.drive import batch_store as store
 from vehicle_detection.drive import batch_trip as trip_module
 from vehicle_detection.drive.batch_plan import list_videos, source_id
 from vehicle_detection.errors import InvalidInputError, OutputError, TransientVideoError, VideoError
-from vehicle_detection.export import TrackWriter
+from vehicle_detection.formats import open_tracks
 
 pytestmark = pytest.mark.usefixtures("private_scratch")
 
@@ -49,7 +49,7 @@ def test_outputs_are_partitioned_and_equal_process_video(card, model, tmp_path):
     )
     expected = tmp_path / "expected.csv"
     single = card / "20260131_093000_F.mp4"
-    with VehicleDetector(model, n_jobs=1) as detector, TrackWriter(expected) as write:
+    with VehicleDetector(model, n_jobs=1) as detector, open_tracks(expected) as write:
         process_video(single, tmp_path / "expected.mp4", detector, workers=1, on_result=write)
     (record,) = (each for each in found.values() if each["start"] == "2026-01-31T09:30:00")
     assert (out / record["outputs"]["video"]).read_bytes() == (tmp_path / "expected.mp4").read_bytes()

@@ -5,7 +5,7 @@ import pytest
 
 from tests.drive.batch_helpers import check_whole, counts, run
 from tests.video.clips import write_clip
-from vehicle_detection import FrameBoxes, evaluate_tracks, find_trips, read_labels
+from vehicle_detection import TrackTable, evaluate_tracks, find_trips, read_labels
 from vehicle_detection.scenes import render_drive
 from vehicle_detection.video import probe_video
 
@@ -36,7 +36,7 @@ def test_a_card_of_twelve_segments_is_one_trip_with_one_identity_per_vehicle(tmp
     assert found["rear"]["frames"] == FRAMES * 2
 
     rows = [(frame, row) for frame, number in enumerate(order) for row in scenes[number].truth]
-    truth = FrameBoxes(
+    truth = TrackTable(
         [frame for frame, _ in rows],
         [row.track for _, row in rows],
         [row.box for _, row in rows],

@@ -1,5 +1,4 @@
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +7,8 @@ from hypothesis import strategies as st
 
 from tests.evaluation.cases import CAR, boxes_of, drives, moved, trials
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, best_f1, evaluate_detections, precision_recall_curve
+from vehicle_detection.evaluation import best_f1, evaluate_detections, precision_recall_curve
+from vehicle_detection.tables import TrackTable
 
 
 def test_counts_ratios_and_sizes_by_hand():
@@ -55,7 +55,7 @@ def test_the_higher_score_matches_and_the_other_is_false():
     assert (scores.tp, scores.fp) == (1, 1)
     assert scores.mean_iou == pytest.approx(90 / 110)
     # Without scores the better fit comes first.
-    assert evaluate_detections(FrameBoxes(found.frames, None, found.boxes), labels).mean_iou == 1
+    assert evaluate_detections(TrackTable(found["frame"], None, found.boxes), labels).mean_iou == 1
 
 
 def test_overlap_at_the_threshold_matches():
@@ -94,14 +94,14 @@ def test_a_curve_needs_scores():
     labels = boxes_of((0, 1, CAR))
     with pytest.raises(InvalidInputError, match="predictions need scores for a curve"):
         precision_recall_curve(labels, labels)
-    assert [part.size for part in precision_recall_curve(FrameBoxes([], [], []), labels)] == [0, 0, 0]
+    assert [part.size for part in precision_recall_curve(TrackTable([], [], []), labels)] == [0, 0, 0]
 
 
 @given(labels=drives())
 def test_mean_iou_decreases_with_the_shift(labels):
     last = 1.0
     for shift in range(0, 200, 3):
-        found = FrameBoxes(labels.frames, labels.tracks, labels.boxes + np.array([shift, 0, shift, 0]))
+        found = TrackTable(labels["frame"], labels["track_id"], labels.boxes + np.array([shift, 0, shift, 0]))
         scores = evaluate_detections(found, labels, iou=0.01)
         if scores.tp < len(labels):
             break
@@ -114,7 +114,7 @@ def test_mean_iou_decreases_with_the_shift(labels):
 def test_ignored_boxes_as_regions_only_remove_false_positives(trial, data):
     found, labels = trial
     ignore = np.array(data.draw(st.lists(st.booleans(), min_size=len(labels), max_size=len(labels))), bool)
-    labels = replace(labels, ignore=ignore)
+    labels = TrackTable(labels["frame"], labels["track_id"], labels.boxes, ignore=ignore)
     plain, lenient = (
         evaluate_detections(found, labels, ignored_as_regions=option) for option in (False, True)
     )
@@ -146,7 +146,7 @@ def test_the_curve_equals_the_scores_at_every_threshold(trial):
     assert (np.diff(thresholds) < 0).all()
     assert (np.diff(recall) >= 0).all()
     for index, threshold in enumerate(thresholds):
-        scores = evaluate_detections(found[found.scores >= threshold], labels)
+        scores = evaluate_detections(found[found["score"] >= threshold], labels)
         assert (scores.precision, scores.recall) == (precision[index], recall[index])
 
 
@@ -159,7 +159,7 @@ def test_best_f1_and_its_threshold():
 
 
 def test_best_f1_without_detections_or_vehicles():
-    labels, nothing = boxes_of((0, 1, CAR)), FrameBoxes([], None, [])
+    labels, nothing = boxes_of((0, 1, CAR)), TrackTable([], None, [])
     f1, threshold = best_f1(*precision_recall_curve(nothing, labels))
     assert f1 == 0
     assert math.isnan(threshold)
@@ -180,7 +180,7 @@ def test_best_f1_is_the_maximum_over_all_thresholds(trial):
     if not len(found):
         return
     f1, threshold = best_f1(*precision_recall_curve(found, labels))
-    assert evaluate_detections(found[found.scores >= threshold], labels).f1 == pytest.approx(f1)
+    assert evaluate_detections(found[found["score"] >= threshold], labels).f1 == pytest.approx(f1)
     assert all(
-        evaluate_detections(found[found.scores >= each], labels).f1 <= f1 + 1e-12 for each in found.scores
+        evaluate_detections(found[found["score"] >= each], labels).f1 <= f1 + 1e-12 for each in found["score"]
     )

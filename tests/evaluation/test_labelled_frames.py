@@ -3,10 +3,11 @@ import numpy as np
 import pytest
 
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
+from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.scenes import render_drive
+from vehicle_detection.tables import TrackTable
 
-LABELS = FrameBoxes([0, 1, 1], None, [[10, 10, 60, 50], [20, 10, 70, 50], [100, 0, 150, 40]], frame_keys=[2])
+LABELS = TrackTable([0, 1, 1], None, [[10, 10, 60, 50], [20, 10, 70, 50], [100, 0, 150, 40]], frame_keys=[2])
 IMAGES = [np.full((60, 160, 3), value, np.uint8) for value in (10, 20)]
 
 
@@ -16,13 +17,13 @@ def test_labelled_frames_have_a_repr_and_iterate():
     assert (len(frames), frames.keys) == (2, (0, 1))
     assert [image[0, 0, 0] for _, image in frames] == [10, 20]
     one = LabelledFrames("one", {1: IMAGES[1]}, LABELS)
-    assert set(one.labels.frames) == {1}
+    assert set(one.labels["frame"].tolist()) == {1}
 
 
 def test_labels_may_name_the_images_without_their_suffix():
-    labels = FrameBoxes(["a", "c"], None, [[0, 0, 50, 40], [9, 0, 59, 40]])
+    labels = TrackTable(["a", "c"], None, [[0, 0, 50, 40], [9, 0, 59, 40]])
     images = dict(zip(("a.jpg", "b.jpg"), IMAGES))
-    assert LabelledFrames("road", images, labels).labels.frames == ("a.jpg",)
+    assert LabelledFrames("road", images, labels).labels["frame"].tolist() == ["a.jpg"]
 
 
 def test_labelled_frames_of_a_video(tmp_path):
@@ -35,7 +36,7 @@ def test_labelled_frames_of_a_video(tmp_path):
     writer.close()
     taken = LabelledFrames.from_video(path, LABELS, every=3, horizon=0.5)
     assert (taken.name, taken.keys, taken.horizon) == ("drive", (0, 3, 6), 0.5)
-    assert set(taken.labels.frames) == {0}
+    assert set(taken.labels["frame"].tolist()) == {0}
     with pytest.raises(InvalidInputError, match="every must be an integer at least 1"):
         LabelledFrames.from_video(path, LABELS, every=0)
 
@@ -47,7 +48,7 @@ def test_labelled_frames_of_a_video(tmp_path):
         (("a", [], LABELS), "frames must hold at least one image"),
         (("a", IMAGES, LABELS, 1.5), "horizon must be a number, at least 0 and at most 1"),
         (("a", IMAGES, LABELS.renamed(lambda key: key + 10)), "labels must name the frames, such as "),
-        (("a", IMAGES, [[0, 0, 9, 9]]), "labels must be a FrameBoxes, got .*; read a file with read_labels"),
+        (("a", IMAGES, [[0, 0, 9, 9]]), "labels must be a TrackTable, got .*; read a file with read_labels"),
         (("a", "frames", LABELS), "frames must be a list of images"),
     ],
 )

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from tests.evaluation.cases import CAR, boxes_of, drives, moved, trials
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, evaluate_detections, evaluate_tracks
+from vehicle_detection.evaluation import evaluate_detections, evaluate_tracks
+from vehicle_detection.tables import TrackTable
 
 IGNORED = np.array([True])
 
@@ -47,20 +48,20 @@ def test_scored_labels_are_matched_before_the_ignore_rules():
 
 def test_a_ratio_without_a_count_is_nan_and_none_in_json():
     labels = boxes_of((0, 1, CAR))
-    empty = evaluate_detections(FrameBoxes([], [], []), labels)
+    empty = evaluate_detections(TrackTable([], [], []), labels)
     assert (empty.tp, empty.fn, empty.recall, empty.f1, empty.average_precision) == (0, 1, 0, 0, 0)
     assert math.isnan(empty.precision)
-    nothing = evaluate_detections(FrameBoxes([], [], []), FrameBoxes([], [], []))
+    nothing = evaluate_detections(TrackTable([], [], []), TrackTable([], [], []))
     assert nothing.frames == 0
     assert math.isnan(nothing.f1)
-    tracked = evaluate_tracks(FrameBoxes([], [], []), FrameBoxes([], [], []))
+    tracked = evaluate_tracks(TrackTable([], [], []), TrackTable([], [], []))
     assert math.isnan(tracked.mota)
     for scores in (empty, nothing, tracked):
         assert "n/a" in str(scores)
         data = json.loads(json.dumps(scores.to_dict(), allow_nan=False))
         assert data["mean_iou"] is None
     assert empty.to_dict()["by_size"]["small"]["f1"] is None
-    assert math.isnan(evaluate_detections(labels, FrameBoxes([], [], [])).recall)
+    assert math.isnan(evaluate_detections(labels, TrackTable([], [], [])).recall)
 
 
 def test_summaries_are_aligned_lines():
@@ -97,10 +98,10 @@ def test_frames_are_checked(evaluate):
     ):
         evaluate(boxes_of(("x", 1, CAR)), labels)
     with pytest.raises(
-        InvalidInputError, match=r"predictions must be FrameBoxes, got .*FrameBoxes\.from_detections"
+        InvalidInputError, match=r"predictions must be a TrackTable, got .*TrackTable\.from_detections"
     ):
         evaluate(found.boxes, labels)
-    with pytest.raises(InvalidInputError, match="labels must be FrameBoxes"):
+    with pytest.raises(InvalidInputError, match="labels must be a TrackTable"):
         evaluate(found, {})
     with pytest.raises(InvalidInputError, match="iou must be a number, greater than 0"):
         evaluate(found, labels, iou=0)
@@ -134,7 +135,7 @@ def test_frame_names_may_differ_by_folder_and_suffix(ours, theirs):
 )
 def test_frame_names_that_may_be_of_other_images_are_refused(ours, theirs):
     found, labels = (boxes_of(*((name, 1, CAR) for name in names)) for names in (ours, theirs))
-    message = r"frame names of predictions and labels differ: .*07.* and .*07.*with FrameBoxes\.renamed"
+    message = r"frame names of predictions and labels differ: .*07.* and .*07.*with TrackTable\.renamed"
     with pytest.raises(InvalidInputError, match=message):
         evaluate_detections(found, labels)
 
@@ -188,9 +189,15 @@ def test_scores_are_invariant_to_track_ids_and_row_order(trial, order):
     renamed = []
     for side, chosen in zip((found, labels), rows):
         part = side[chosen]
-        tracks = np.array(names)[part.tracks]
+        tracks = np.array(names)[part["track_id"]]
         renamed.append(
-            FrameBoxes(part.frames, tracks, part.boxes, scores=part.scores, frame_keys=side.frame_keys)
+            TrackTable(
+                part["frame"],
+                tracks,
+                part.boxes,
+                score=part["score"],
+                frame_keys=side.frame_keys,
+            )
         )
     same(evaluate_tracks(found, labels), evaluate_tracks(*renamed))
 
@@ -205,18 +212,18 @@ def test_scores_are_invariant_to_frame_names(trial):
 @given(trial=trials(), box=st.tuples(st.integers(2000, 2200), st.integers(0, 80)))
 def test_a_prediction_in_an_ignored_region_changes_no_score(trial, box):
     found, labels = trial
-    region = FrameBoxes(
-        [*labels.frames, 0],
-        [*labels.tracks, -1],
+    region = TrackTable(
+        [*labels["frame"].tolist(), 0],
+        [*labels["track_id"], -1],
         [*labels.boxes, (2000, 0, 2500, 300)],
         ignore=np.arange(len(labels) + 1) == len(labels),
         frame_keys=labels.frame_keys,
     )
-    more = FrameBoxes(
-        [*found.frames, 0],
-        [*found.tracks, 55],
+    more = TrackTable(
+        [*found["frame"].tolist(), 0],
+        [*found["track_id"], 55],
         [*found.boxes, (*box, box[0] + 90, box[1] + 60)],
-        scores=[*found.scores, 9.0],
+        score=[*found["score"], 9.0],
         frame_keys=found.frame_keys,
     )
     for evaluate in (evaluate_detections, evaluate_tracks):

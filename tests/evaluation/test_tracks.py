@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from tests.evaluation.cases import CAR, boxes_of, moved, trials
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, evaluate_tracks
+from vehicle_detection.evaluation import evaluate_tracks
+from vehicle_detection.tables import TrackTable
 
 
 def clip(tracks, *, step=4.0, offset=(0.0,)):
@@ -20,7 +21,7 @@ def clip(tracks, *, step=4.0, offset=(0.0,)):
         for frame, track in enumerate(tracks)
         if track is not None
     ]
-    return (boxes_of(*rows) if rows else FrameBoxes([], [], [])), labels
+    return (boxes_of(*rows) if rows else TrackTable([], [], [])), labels
 
 
 @pytest.mark.parametrize(
@@ -86,7 +87,7 @@ def test_consecutive_frames_differ_by_the_smallest_step():
 )
 def test_longest_false_positive_run_by_hand(frames, longest):
     _, labels = clip([None] * 8)
-    false = boxes_of(*((f, 9, moved(700)) for f in frames)) if frames else FrameBoxes([], [], [])
+    false = boxes_of(*((f, 9, moved(700)) for f in frames)) if frames else TrackTable([], [], [])
     assert evaluate_tracks(false, labels).longest_false_positive_run == longest
 
 
@@ -120,7 +121,7 @@ def crowds(draw):
             for track in range(3)
             if draw(st.integers(0, 5))
         ]
-        sides.append(boxes_of(*rows, frame_keys=range(length)) if rows else FrameBoxes([], [], []))
+        sides.append(boxes_of(*rows, frame_keys=range(length)) if rows else TrackTable([], [], []))
     return sides[1], sides[0]
 
 
@@ -133,7 +134,7 @@ def test_track_scores_equal_those_of_motmetrics(trial):
         truth, here = labels.frame(key), found.frame(key)
         overlap = iou_matrix(truth.boxes, here.boxes)
         distance = np.where(overlap >= 0.5, 1 - overlap, np.nan)
-        accumulator.update(truth.tracks, here.tracks, distance)
+        accumulator.update(truth["track_id"], here["track_id"], distance)
     names = ("mota", "idf1", "num_switches", "num_fragmentations", "num_misses", "num_false_positives")
     row = motmetrics.metrics.create().compute(accumulator, metrics=list(names), name="clip").iloc[0]
     scores = evaluate_tracks(found, labels)
@@ -148,8 +149,8 @@ def trackeval_hota(found, labels):
     trackeval = pytest.importorskip("trackeval")
 
     def numbered(side):
-        order = {track: number for number, track in enumerate(np.unique(side.tracks).tolist())}
-        frames = [side.tracks[side.rows(key)].tolist() for key in labels.frame_keys]
+        order = {track: number for number, track in enumerate(np.unique(side["track_id"]).tolist())}
+        frames = [side["track_id"][side.rows(key)].tolist() for key in labels.frame_keys]
         return [np.array([order[track] for track in each], int) for each in frames], len(order)
 
     (gt_ids, num_gt_ids), (tracker_ids, num_tracker_ids) = numbered(labels), numbered(found)
@@ -173,8 +174,11 @@ def trackeval_hota(found, labels):
 @settings(max_examples=60)
 def test_hota_equals_that_of_trackeval(trial):
     found, labels = trial
-    labels = FrameBoxes(
-        labels.frames, labels.tracks, labels.boxes, frame_keys={*found.frame_keys, *labels.frame_keys}
+    labels = TrackTable(
+        labels["frame"],
+        labels["track_id"],
+        labels.boxes,
+        frame_keys={*found.frame_keys, *labels.frame_keys},
     )
     scores = evaluate_tracks(found, labels)
     if len(found) or len(labels):
@@ -229,7 +233,7 @@ def test_hota_by_hand():
     assert "HOTA" in scores.summary()
     missed = evaluate_tracks(*clip([None, None]))
     assert (missed.hota, missed.deta, missed.assa, missed.loca) == (0, 0, 0, 1)  # as in TrackEval
-    assert math.isnan(evaluate_tracks(FrameBoxes([], [], []), FrameBoxes([], [], [])).hota)
+    assert math.isnan(evaluate_tracks(TrackTable([], [], []), TrackTable([], [], [])).hota)
 
 
 def test_hota_leaves_ignored_boxes_out():

@@ -7,8 +7,8 @@ from vehicle_detection import notebook
 from vehicle_detection.boxes import Detections
 from vehicle_detection.datasets import PatchSet, Split, find_near_duplicates
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes
 from vehicle_detection.notebook.style import OTHER, SKY, TRUTH, VEHICLE, evenly_spaced
+from vehicle_detection.tables import TrackTable
 
 
 def test_an_image_is_described():
@@ -44,7 +44,7 @@ def test_only_arrays_of_numbers_are_described(value):
 
 def test_images_have_titles_and_boxes():
     found = Detections([[10, 20, 30, 40], [50, 20, 60, 40]], [1.0, 0.5])
-    truth = FrameBoxes([0, 0], None, [[11, 20, 30, 40], [70, 0, 90, 20]], ignore=[False, True])
+    truth = TrackTable([0, 0], None, [[11, 20, 30, 40], [70, 0, 90, 20]], ignore=[False, True])
     figure = notebook.show_images(
         {"a": gray_image(), "b": np.arange(12.0).reshape(3, 4)}, boxes=[found, None], truth=[truth, None]
     )

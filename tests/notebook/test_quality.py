@@ -9,30 +9,26 @@ from vehicle_detection import notebook
 from vehicle_detection.boxes import Detections
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import (
-    FrameBoxes,
-    LabelledFrames,
-    evaluate_detections,
-    precision_recall_curve,
-)
+from vehicle_detection.evaluation import LabelledFrames, evaluate_detections, precision_recall_curve
 from vehicle_detection.images import write_image
 from vehicle_detection.notebook.style import VERMILION
+from vehicle_detection.tables import TrackTable
 
 
 def labelled():
     """Three frames with a detected and two missed vehicles, two false positives and an ignored detection."""
     image = np.random.default_rng(0).integers(0, 256, (120, 200, 3), np.uint8)
-    labels = FrameBoxes(
+    labels = TrackTable(
         ["a.png", "a.png", "b.png", "b.png"],
         None,
         [[10, 10, 60, 50], [100, 10, 130, 40], [20, 20, 110, 100], [150, 0, 200, 60]],
         ignore=[False, False, False, True],
     )
-    found = FrameBoxes(
+    found = TrackTable(
         ["a.png", "b.png", "b.png", "c.png"],
         None,
         [[11, 10, 60, 50], [160, 5, 190, 50], [60, 60, 110, 100], [5, 5, 45, 45]],
-        scores=[2.0, 3.0, 0.5, 1.0],
+        score=[2.0, 3.0, 0.5, 1.0],
     )
     return LabelledFrames("road", dict.fromkeys(("a.png", "b.png", "c.png"), image), labels), found
 
@@ -80,13 +76,13 @@ def test_boxes_have_the_same_position_in_the_crop_as_in_the_frame():
 
 def test_perfect_detections_have_no_errors_to_show(tmp_path):
     write_image(tmp_path / "a.png", gray_image())
-    truth = FrameBoxes(["a.png"], None, [[10, 10, 60, 50]])
+    truth = TrackTable(["a.png"], None, [[10, 10, 60, 50]])
     frames = LabelledFrames("road", load_frames(tmp_path), truth)
-    perfect = FrameBoxes(["a.png"], None, truth.boxes, scores=[1.0])
+    perfect = TrackTable(["a.png"], None, truth.boxes, score=[1.0])
     axes = notebook.plot_errors(frames, perfect, ax=new_axes())
     assert (axes.get_title(), len(axes.images)) == ("0 of 1 vehicles missed", 0)
     assert notebook.plot_errors(frames, perfect, kind="false", ax=new_axes()).get_title().startswith("0 of 1")
-    nothing = FrameBoxes([], None, [], scores=[])
+    nothing = TrackTable([], None, [], score=[])
     assert len(notebook.plot_errors(frames, nothing, ax=new_axes()).images) == 1  # read from the folder
 
 
@@ -96,7 +92,7 @@ def test_malformed_options_of_the_errors_are_rejected():
         notebook.plot_errors(frames, found, kind="wrong")
     with pytest.raises(InvalidInputError, match="frames must be a LabelledFrames, got"):
         notebook.plot_errors([gray_image()], found)
-    with pytest.raises(InvalidInputError, match="predictions must be FrameBoxes, got"):
+    with pytest.raises(InvalidInputError, match="predictions must be TrackTable, got"):
         notebook.plot_errors(frames, Detections.empty())
     with pytest.raises(InvalidInputError, match=r"predictions hold frame 'x.png', which is not among the 3"):
         notebook.plot_errors(frames, found.renamed(lambda name: name.replace("c", "x")))

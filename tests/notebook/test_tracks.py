@@ -9,9 +9,9 @@ from tests.notebook.helpers import legend, new_axes, texts
 from vehicle_detection import notebook
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes
 from vehicle_detection.notebook.style import COLORS
 from vehicle_detection.scenes import render_drive
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.tracking import FrameResult, Track
 from vehicle_detection.video import VideoReport
 
@@ -71,14 +71,14 @@ def test_frames_may_have_times_and_short_tracks_are_left_out():
 def test_tracks_of_a_file_are_compared_with_the_truth_of_a_drive():
     drive = render_drive(frames=30, shape=(180, 320), scenario="overtaking", random_state=3)
     rows = [(frame, row) for frame, rows in enumerate(drive.truth) for row in rows if not row.ignore]
-    labels = FrameBoxes(
+    labels = TrackTable(
         [frame for frame, _ in rows],
         np.array([row.track for _, row in rows]),
         np.array([row.box for _, row in rows]),
         distance_m=np.array([row.distance_m for _, row in rows]),
     )
     figure = notebook.plot_tracks(labels, truth=drive.truth)
-    count = len(set(labels.tracks.tolist()))
+    count = len(set(labels["track_id"].tolist()))
     assert len(figure.axes[0].lines) == 2 * count
     found, true = figure.axes[2].lines[0], figure.axes[2].lines[count]
     shown = ~np.isnan(found.get_ydata())
@@ -86,7 +86,7 @@ def test_tracks_of_a_file_are_compared_with_the_truth_of_a_drive():
     assert true.get_color() == "k"
     assert texts(figure.legends[0].get_texts())[-1] == "truth"
     assert not figure.axes[2].collections  # a file has no standard errors
-    ignored = FrameBoxes([0, 1], [1, 2], [[0, 0, 9, 9]] * 2, ignore=[False, True])
+    ignored = TrackTable([0, 1], [1, 2], [[0, 0, 9, 9]] * 2, ignore=[False, True])
     both = notebook.plot_tracks(labels, truth=ignored)
     assert len(both.axes[0].lines) == count + 1
 
@@ -97,16 +97,16 @@ def test_tracks_of_a_file_are_compared_with_the_truth_of_a_drive():
         ([], {}, "results must hold at least one track to plot, got none"),
         ([result(0, track(1, 1.0, shown=False))], {}, "results must hold at least one track to plot"),
         ([3], {}, "results must be a FrameResult, got 3;"),
-        (3, {}, "results must be the FrameResult of each frame, or FrameBoxes; got 3"),
+        (3, {}, "results must be the FrameResult of each frame, or TrackTable; got 3"),
         (
-            FrameBoxes(["a"], [1], [[0, 0, 9, 9]]),
+            TrackTable(["a"], [1], [[0, 0, 9, 9]]),
             {},
             "results must have numbered frames, got names such as 'a'",
         ),
         (
             [result(0, track(1, 1.0))],
             {"truth": "t.csv"},
-            "truth must be FrameBoxes or the truth of a rendered drive",
+            "truth must be TrackTable or the truth of a rendered drive",
         ),
         ([result(0, track(1, 1.0))], {"fps": 0}, "fps must be a number, greater than 0"),
     ],

@@ -8,7 +8,8 @@ from tools import measure_model
 from tools.measure_model import choose_sources, format_rows, light_of, measure
 from vehicle_detection import detector_from
 from vehicle_detection.errors import DatasetError
-from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
+from vehicle_detection.evaluation import LabelledFrames
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.training import FrameDataset
 
 VEHICLE = [10, 10, 60, 50]
@@ -28,7 +29,7 @@ def model_of(confidence):
 def gray(name, levels):
     """Frames of these gray levels, with the same vehicle in each."""
     images = [np.full((60, 160, 3), level, np.uint8) for level in levels]
-    labels = FrameBoxes(list(range(len(levels))), None, [VEHICLE] * len(levels))
+    labels = TrackTable(list(range(len(levels))), None, [VEHICLE] * len(levels))
     return FrameDataset(name, (LabelledFrames(name, images, labels),))
 
 

@@ -6,10 +6,11 @@ pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
 from tests.helpers import drawn
 from tools.model_card import calibration_rows, write_card
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
+from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.network import NetworkModel
 from vehicle_detection.network.inputs import InputFormat
 from vehicle_detection.network.outputs import OutputFormat
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.training import FoldDetections, FrameDataset
 
 SOURCES = [FrameDataset("us_side", (drawn(range(3), "us_side"),)), FrameDataset("own", (drawn([4]),))]
@@ -27,7 +28,7 @@ BOXES = [[100, 80, 200, 180], [170, 60, 260, 150], [300, 100, 330, 125], [0, 90,
 
 def fold(source, shown, scores, gray=90):
     """Detections of the boxes `shown` in one frame, and of one that is false."""
-    labels = FrameBoxes(
+    labels = TrackTable(
         [0] * 5,
         np.arange(5),
         BOXES,
@@ -35,7 +36,7 @@ def fold(source, shown, scores, gray=90):
         ignore=np.array([0, 0, 0, 0, 1], np.bool_),
     )
     boxes = [*(BOXES[row] for row in shown), [10, 10, 40, 30]]
-    found = FrameBoxes([0] * len(boxes), None, boxes, scores=np.array(scores, float))
+    found = TrackTable([0] * len(boxes), None, boxes, score=np.array(scores, float))
     images = {0: np.full((200, 400, 3), gray, np.uint8)}
     return FoldDetections(source, LabelledFrames(source, images, labels), found)
 

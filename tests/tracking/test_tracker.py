@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from vehicle_detection.boxes import Detections, Platt, iou_matrix
 from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, evaluate_tracks
+from vehicle_detection.evaluation import evaluate_tracks
 from vehicle_detection.scenes import render_drive
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.tracking import Track, Tracker, TrackParams
 
 SHAPE = (720, 1280, 3)
@@ -1054,7 +1055,7 @@ def simulated_detections(truth, shape, *, seed, misses=0.1, clutter=0.3):
 def labels_of(frames):
     """Labels from ``(track, box, ignore)`` of each frame."""
     rows = [(index, *row) for index, frame in enumerate(frames) for row in frame]
-    return FrameBoxes(
+    return TrackTable(
         [row[0] for row in rows],
         np.array([row[1] for row in rows], np.int64),
         np.array([row[2] for row in rows], float).reshape(-1, 4),

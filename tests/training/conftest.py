@@ -4,9 +4,10 @@ import pytest
 from tests.helpers import random_classifier
 from tests.training.trial_cases import SMALL
 from vehicle_detection.datasets import PatchSet
-from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
+from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.features import FeatureParams
 from vehicle_detection.scenes import render_patches, render_scene
+from vehicle_detection.tables import TrackTable
 
 
 @pytest.fixture(scope="package")
@@ -30,7 +31,7 @@ def labels(scenes):
         for truth in scene.truth
     ]
     frames, boxes, ignore = zip(*rows)
-    return FrameBoxes(frames, None, np.array(boxes), ignore=np.array(ignore), frame_keys=range(len(scenes)))
+    return TrackTable(frames, None, np.array(boxes), ignore=np.array(ignore), frame_keys=range(len(scenes)))
 
 
 @pytest.fixture(scope="package")

@@ -10,8 +10,9 @@ pytest.importorskip("onnx", reason="export needs onnx, the extra [train]")
 from tests.helpers import drawn  # noqa: E402
 from tests.training.networks import random_network  # noqa: E402
 from vehicle_detection.errors import InvalidInputError, ModelFileError  # noqa: E402
-from vehicle_detection.evaluation import FrameBoxes, LabelledFrames  # noqa: E402
+from vehicle_detection.evaluation import LabelledFrames  # noqa: E402
 from vehicle_detection.network import load_network  # noqa: E402
+from vehicle_detection.tables import TrackTable  # noqa: E402
 from vehicle_detection.training import (  # noqa: E402
     FrameDataset,
     detect_logits,
@@ -109,7 +110,7 @@ def test_steps_follow_from_the_number_of_frames():
 def numbered(count, vehicles=None, name="road"):
     """Frames of which those in `vehicles`, by default all, show one."""
     keys = list(range(count) if vehicles is None else vehicles)
-    labels = FrameBoxes(keys, None, [[10, 10, 50, 40]] * len(keys), frame_keys=list(range(count)))
+    labels = TrackTable(keys, None, [[10, 10, 50, 40]] * len(keys), frame_keys=list(range(count)))
     return LabelledFrames(name, [np.zeros((60, 80, 3), np.uint8)] * count, labels)
 
 
@@ -147,7 +148,7 @@ def test_the_only_vehicle_is_trained_on():
 
 def test_bad_input_is_refused_before_the_training(initial, tmp_path, monkeypatch):
     monkeypatch.setattr(fine_tune, "train_network", None)
-    outside = FrameBoxes([1], None, [[300, 10, 350, 40]])
+    outside = TrackTable([1], None, [[300, 10, 350, 40]])
     beside = dataclasses.replace(numbered(2), labels=outside)
     for sources, message in (
         ([FrameDataset("road", (numbered(3, vehicles=[]),))], "sources must show at least one vehicle, got"),

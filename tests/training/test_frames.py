@@ -7,9 +7,11 @@ import pytest
 from tests.helpers import drawn, write_frame_set
 from tests.video.clips import gray_frames, write_clip
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, read_labels, write_labels
+from vehicle_detection.evaluation import LabelledFrames
+from vehicle_detection.formats import read_labels, write_labels
 from vehicle_detection.images import write_image
 from vehicle_detection.scenes import render_drive
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.training import (
     FrameDataset,
     check_sources,
@@ -129,7 +131,7 @@ def test_a_source_without_vehicles(tmp_path):
 def frames_of(height, width):
     """A source of one frame with a vehicle and an ignored box."""
     image = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
-    labels = FrameBoxes([0, 0], None, [[10, 20, 60, 50], [0, 0, width, 10]], ignore=[False, True])
+    labels = TrackTable([0, 0], None, [[10, 20, 60, 50], [0, 0, width, 10]], ignore=[False, True])
     return FrameDataset("road", (LabelledFrames("road", [image], labels),)), image
 
 

@@ -6,10 +6,11 @@ import pytest
 from tests.training.trial_cases import SEARCH, SMALL
 from vehicle_detection.datasets import PatchSet, load_frames
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, read_labels
 from vehicle_detection.features import FeatureParams
+from vehicle_detection.formats import read_labels
 from vehicle_detection.images import write_image
 from vehicle_detection.search import SearchBand, SearchParams
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.training import TrainingOptions, mine_negatives, train_classifier
 from vehicle_detection.windows import find_cars
 
@@ -33,7 +34,7 @@ def test_mined_windows_touch_no_label(scenes, labels, random_svm):
         for x1, y1, x2, y2 in labels.boxes[labels.rows(int(number))]:
             assert left >= x2 - 1 or right <= x1 + 1 or top >= y2 - 1 or bottom <= y1 + 1
     # Without labels, windows on vehicles are false positives as well.
-    nothing = FrameBoxes([], None, [], frame_keys=(0, 1))
+    nothing = TrackTable([], None, [], frame_keys=(0, 1))
     unlabelled = mine_negatives(images, nothing, random_svm, search_params=SEARCH, max_overlap=1.0)
     assert len(unlabelled) > len(mined)
     assert len(unlabelled) == sum(len(find_cars(image, random_svm, SEARCH)) for image in images.values())
@@ -43,7 +44,7 @@ def test_a_mined_patch_is_the_window_that_was_searched(random_svm):
     # In a frame of this width, windows of 64 pixels are not resized: the patch is a crop of the frame.
     image = np.random.default_rng(3).integers(0, 256, (200, 1280, 3), np.uint8)
     search = SearchParams(bands=(SearchBand(window=(64, 64), y=(0, 100)),), horizon=0.25)
-    nothing = FrameBoxes([], None, [], frame_keys=[0])
+    nothing = TrackTable([], None, [], frame_keys=[0])
     mined = mine_negatives([image], nothing, random_svm, search_params=search)
     assert len(mined) > 5
     _, boxes = boxes_of(mined)
@@ -62,7 +63,7 @@ def test_a_window_outside_the_frame_repeats_its_border(random_svm):
     )
     mined = mine_negatives(
         [image],
-        FrameBoxes([], None, [], frame_keys=[0]),
+        TrackTable([], None, [], frame_keys=[0]),
         random_svm,
         search_params=search,
         min_score=-1e6,
@@ -84,7 +85,7 @@ def test_options_limit_the_number_of_windows(frames, labels, random_svm):
     assert count(min_score=1.0) < count() < count(min_score=-1.0)
     assert count(max_per_frame=2) == 4
     assert count(min_score=1e5) == 0
-    everything = FrameBoxes([0, 1], None, [[0, 0, 640, 360]] * 2, ignore=np.array([True, True]))
+    everything = TrackTable([0, 1], None, [[0, 0, 640, 360]] * 2, ignore=np.array([True, True]))
     assert len(mine_negatives(frames.frames, everything, random_svm, search_params=SEARCH)) == 0
 
 
@@ -102,7 +103,7 @@ def test_training_with_mined_patches_removes_false_positives(patch_set, frames, 
 
 def test_frames_of_a_folder_are_mined_by_name(tmp_path, scenes, random_svm):
     write_image(tmp_path / "road one.png", scenes[0].image)
-    boxes = FrameBoxes(["road one.png"], None, [[0, 0, 5, 5]])
+    boxes = TrackTable(["road one.png"], None, [[0, 0, 5, 5]])
     mined = mine_negatives(load_frames(tmp_path), boxes, random_svm, search_params=SEARCH, source="road")
     assert mined.names[0].startswith("non-vehicles/road/road one.png_")
     assert set(mined.sources) == {"road"}

@@ -49,12 +49,12 @@ def test_labels_of_rendered_frames(source):
     labels = frames.labels
     sides = {max(image.shape) for _, image in frames}
     assert sides <= {640, 1280}
-    assert labels.truncated.max() > 0.2
-    assert labels.occluded.max() > 0
-    usable = labels[~labels.ignore]
+    assert labels["truncated"].max() > 0.2
+    assert labels["occluded"].max() > 0
+    usable = labels[~labels["ignore"]]
     assert (usable.boxes[:, 2] - usable.boxes[:, 0]).min() >= 20
-    assert usable.truncated.max() <= 0.7
-    assert usable.occluded.max() < 2
+    assert usable["truncated"].max() <= 0.7
+    assert usable["occluded"].max() < 2
     for key, image in frames:
         boxes = labels.frame(key).boxes
         assert (boxes[:, 2:] <= image.shape[1::-1]).all()

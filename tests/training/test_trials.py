@@ -5,8 +5,9 @@ from tests.training.trial_cases import SEARCH, SMALL, UNTIMED
 from vehicle_detection.datasets import PatchSet, Split, make_split, split_sequences
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections
+from vehicle_detection.evaluation import LabelledFrames, evaluate_detections
 from vehicle_detection.features import FeatureParams
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.training import (
     FeatureCache,
     TrainingOptions,
@@ -83,7 +84,7 @@ def test_frames_are_scored_like_the_detector(patch_set, frames, labels):
     scores = []
     for each in (frames, other):
         with VehicleDetector(classifier, search_params=SEARCH, horizon=each.horizon) as detector:
-            found = FrameBoxes.from_detections({key: detector.detect(image) for key, image in each})
+            found = TrackTable.from_detections({key: detector.detect(image) for key, image in each})
         scores.append(evaluate_detections(found, each.labels, frames=each.keys))
     assert row["frame_f1"] == pytest.approx(np.nanmean([score.f1 for score in scores]))
     assert row["frame_average_precision"] == pytest.approx(np.mean([s.average_precision for s in scores]))

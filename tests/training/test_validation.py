@@ -6,7 +6,8 @@ import pytest
 
 from vehicle_detection import detector_from
 from vehicle_detection.boxes import Detections
-from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
+from vehicle_detection.evaluation import LabelledFrames
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.training import (
     FOLD_COLUMNS,
     FoldDetections,
@@ -25,7 +26,7 @@ def fold_of(scores, hits, *, frames=4, empty=0, source="road"):
     vehicle, beside = [10.0, 10.0, 60.0, 50.0], [100.0, 10.0, 150.0, 50.0]
     images = [np.zeros((60, 160, 3), np.uint8)] * frames
     full = range(frames - empty)
-    labels = FrameBoxes(list(full), None, [vehicle for _ in full], frame_keys=list(range(frames)))
+    labels = TrackTable(list(full), None, [vehicle for _ in full], frame_keys=list(range(frames)))
     found = {key: [] for key in range(frames)}
     for key, (score, hit) in enumerate(zip(scores, hits)):
         found[key % frames].append((vehicle if hit else beside, score))
@@ -36,7 +37,7 @@ def fold_of(scores, hits, *, frames=4, empty=0, source="road"):
         for key, rows in found.items()
     }
     return FoldDetections(
-        source, LabelledFrames(source, images, labels), FrameBoxes.from_detections(detections)
+        source, LabelledFrames(source, images, labels), TrackTable.from_detections(detections)
     )
 
 
@@ -58,8 +59,8 @@ def test_fold_scores_by_hand():
 def test_a_vehicle_in_an_ignored_group_is_not_false_in_the_region_scores():
     fold = fold_of([1.0, 0.5, 0.2], [True, True, False])
     single = fold.frames.labels
-    labels = FrameBoxes(
-        [*single.frames, 2],
+    labels = TrackTable(
+        [*single["frame"], 2],
         range(5),
         [*single.boxes, [80.0, 0.0, 160.0, 60.0]],
         ignore=np.arange(5) == 4,
@@ -149,7 +150,7 @@ def test_recall_of_vehicles_that_are_hard_to_find():
         [60, 20, 100, 50], [60, 60, 100, 90], [120, 20, 150, 50], [2, 20, 50, 50], [120, 60, 160, 99],
         [10, 60, 50, 90], [0, 0, 30, 10],
     ]  # fmt: skip
-    labels = FrameBoxes(
+    labels = TrackTable(
         [0] * 7,
         range(7),
         boxes,
@@ -158,7 +159,7 @@ def test_recall_of_vehicles_that_are_hard_to_find():
         ignore=np.arange(7) == 6,
     )
     frames = LabelledFrames("road", [np.zeros((100, 200, 3), np.uint8)], labels)
-    found = FrameBoxes([0] * 3, None, [boxes[0], boxes[3], boxes[2]], scores=[1.0, 0.5, -0.5])
+    found = TrackTable([0] * 3, None, [boxes[0], boxes[3], boxes[2]], score=[1.0, 0.5, -0.5])
     score = score_fold(FoldDetections("road", frames, found), 0.0)
     assert (score.occluded, score.truncated, score.narrow) == (1, 3, 1)
     assert (score.recall_occluded, score.recall_truncated) == (0.0, pytest.approx(1 / 3))
@@ -171,10 +172,10 @@ def test_recall_of_vehicles_that_are_hard_to_find():
 def test_false_boxes_in_frames_without_vehicles():
     # Frame 0 shows a vehicle, frame 1 an ignored box, frame 2 nothing.
     vehicle, beside = [10.0, 10.0, 60.0, 50.0], [100.0, 10.0, 150.0, 50.0]
-    labels = FrameBoxes([0, 1], None, [vehicle, vehicle], ignore=[False, True])
+    labels = TrackTable([0, 1], None, [vehicle, vehicle], ignore=[False, True])
     frames = LabelledFrames("road", [np.zeros((60, 160, 3), np.uint8)] * 3, labels)
-    found = FrameBoxes(
-        [0, 1, 1, 2, 2], None, [beside, vehicle, beside, vehicle, beside], scores=[1, 1, 1, 1, -1]
+    found = TrackTable(
+        [0, 1, 1, 2, 2], None, [beside, vehicle, beside, vehicle, beside], score=[1, 1, 1, 1, -1]
     )
     score = score_fold(FoldDetections("road", frames, found), 0.0)
     assert (score.false_per_empty_frame, score.false_per_vehicle_free_frame) == (1.0, 1.0)

@@ -9,7 +9,7 @@ import pytest
 
 from tests.helpers import random_network
 from tests.video.clips import child_processes, ffmpeg, running_threads
-from vehicle_detection import TrackWriter, VehicleDetector, process_video, track, write_video
+from vehicle_detection import VehicleDetector, open_tracks, process_video, track, write_video
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes import render_drive
@@ -39,11 +39,11 @@ def boxes(results):
 
 def test_the_frames_are_those_of_process_video(clip, detector, tmp_path):
     expected = []
-    with TrackWriter(tmp_path / "expected.csv") as write:
+    with open_tracks(tmp_path / "expected.csv") as write:
         process_video(clip, None, detector, on_result=lambda each: (expected.append(each), write(each)))
     assert any(result.tracks for result in expected)
     found = []
-    with TrackWriter(tmp_path / "found.csv") as write:
+    with open_tracks(tmp_path / "found.csv") as write:
         for result in track(clip, detector, frames=True):
             write(result)
             found.append(result)

@@ -70,8 +70,8 @@ def _run(
     """Draw a drive, annotate and score it, oncoming vehicles too; an error leaves no file in the folder."""
     from vehicle_detection._common import temporary_folder
     from vehicle_detection.drive import ReportWriter
-    from vehicle_detection.evaluation import evaluate_tracks, read_labels
-    from vehicle_detection.export import TrackWriter
+    from vehicle_detection.evaluation import evaluate_tracks
+    from vehicle_detection.formats import open_tracks, read_labels
     from vehicle_detection.images import write_image
     from vehicle_detection.scenes import render_drive
     from vehicle_detection.video import process_video
@@ -83,7 +83,7 @@ def _run(
         draw_clip(drive, clip, labels, progress=True)
         # Compile the kernels now, so that the reported speed does not include it.
         detector.warm_up(drive.shape)
-        with TrackWriter(tracks) as write:
+        with open_tracks(tracks) as write:
             writers: list[Callable[[Any], object]] = [write, page]
             done = process_video(
                 clip, annotated, detector, on_result=lambda result: [each(result) for each in writers]

@@ -65,8 +65,10 @@ def detect(options: DetectOptions) -> None:
 
     Exit code 3: some images cannot be decoded, and are left out.
     """
+    from vehicle_detection._common import encodable
     from vehicle_detection.detector import VehicleDetector
-    from vehicle_detection.export import write_boxes
+    from vehicle_detection.formats import write_tracks
+    from vehicle_detection.tables import TrackTable
 
     images = list(dict.fromkeys(itertools.chain.from_iterable(map(_expand, options.images))))
     _check(options, images)
@@ -86,7 +88,8 @@ def detect(options: DetectOptions) -> None:
             deque(found, maxlen=0)
         else:
             with option_names(path="--boxes"):
-                rows = write_boxes(found, options.boxes)
+                table = TrackTable.from_detections({encodable(str(path)): each for path, each in found})
+                rows = write_tracks(table, options.boxes)
             print_line(f"wrote {rows} boxes to {options.boxes}")
     folders = [str(folder) for folder in (options.output, options.why) if folder is not None]
     if folders:

@@ -14,7 +14,7 @@ from vehicle_detection.cli.output import check_distinct_paths, print_error, prin
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from vehicle_detection.evaluation import FrameBoxes, FrameKey
+    from vehicle_detection.tables import FrameKey, TrackTable
 
 
 def evaluate(
@@ -45,20 +45,17 @@ def evaluate(
     from json import dumps
 
     from vehicle_detection._common import check_target, write_text
-    from vehicle_detection.evaluation import (
-        NO_TRACK,
-        evaluate_detections,
-        evaluate_tracks,
-        match_names,
-        read_labels,
-    )
+    from vehicle_detection.evaluation import evaluate_detections, evaluate_tracks
+    from vehicle_detection.formats import read_labels
+    from vehicle_detection.tables import NO_TRACK, match_names
 
     if json is not None:
         check_target(json, "--json")
         check_distinct_paths({"--json": json}, {"PREDICTIONS": predictions, "LABELS": labels})
     found, true = read_labels(predictions, truth=labels, images=images), read_labels(labels, images=images)
     # Equal scores may be flags of labels, as in MOTChallenge's ground truth.
-    if len(found) and found.scores is None and true.scores is not None and len(set(true.scores)) > 1:
+    scored = "score" in true.columns and len(set(true["score"].tolist())) > 1
+    if len(found) and "score" not in found.columns and scored:
         raise InvalidInputError(
             f"{labels} has scores and {predictions} has none, so they seem to be swapped; pass the "
             "predictions first, then the labels; if these are labels with scores, remove the scores"
@@ -67,16 +64,16 @@ def evaluate(
     chosen = None
     if frames is not None:
         chosen = _parse_frames(frames, true.frame_keys)
-        found, true = (_boxes_in(each, chosen) for each in (found, true))
+        found, true = (each.select(chosen) for each in (found, true))
     options: dict[str, Any] = {"iou": iou, "ignored_as_regions": ignored_as_regions, "frames": chosen}
     scores: dict[str, Any] = {"detections": evaluate_detections(found, true, **options)}
-    unknown = [int(((boxes.tracks == NO_TRACK) & ~boxes.ignore).sum()) for boxes in (found, true)]
+    unknown = [int(((boxes["track_id"] == NO_TRACK) & ~boxes["ignore"]).sum()) for boxes in (found, true)]
     if not any(unknown):
         scores["tracks"] = evaluate_tracks(found, true, **options)
     print_line("\n\n".join(each.summary() for each in scores.values()))
     _note_frames_of_one_file(found, true, chosen, predictions, labels)
     for boxes, count, file in zip((found, true), unknown, (predictions, labels)):
-        if 0 < count < (~boxes.ignore).sum():
+        if 0 < count < (~boxes["ignore"]).sum():
             noun = "box has" if count == 1 else "boxes have"
             print_error(f"note: the tracks are not scored: {count} {noun} no track in {file}")
     if json is not None:
@@ -84,29 +81,23 @@ def evaluate(
 
 
 def _note_frames_of_one_file(
-    found: FrameBoxes, true: FrameBoxes, chosen: Collection[FrameKey] | None, predictions: Path, labels: Path
+    found: TrackTable, true: TrackTable, chosen: Collection[FrameKey] | None, predictions: Path, labels: Path
 ) -> None:
     """Print a note if many frames have labels and no boxes, or boxes and no labels."""
-    labelled = set(true.frames if chosen is None else chosen)
-    unseen = len(labelled - set(found.frames))
+    labelled = set(true["frame"].tolist() if chosen is None else chosen)
+    unseen = len(labelled - set(found["frame"].tolist()))
     if unseen > 0.5 * len(labelled):
         print_error(
             f"note: {unseen} of {len(labelled)} labelled frames have no box in {predictions}, so their "
             "vehicles count as missed; pass --frames if not all of them were searched"
         )
-    searched = set(found[~found.ignore].frames)
+    searched = set(found["frame"][~found["ignore"]].tolist())
     unlabelled = len(searched - set(true.frame_keys if chosen is None else chosen))
     if unlabelled > 0.1 * len(searched):
         print_error(
             f"note: {unlabelled} of {len(searched)} frames with boxes have no row in {labels}, so their "
             "boxes count as false; pass --frames if not all of them are labelled"
         )
-
-
-def _boxes_in(boxes: FrameBoxes, frames: Sequence[FrameKey]) -> FrameBoxes:
-    """Boxes in some frames."""
-    wanted = set(frames)
-    return boxes[[row for row, key in enumerate(boxes.frames) if key in wanted]]
 
 
 def _parse_frames(text: str, keys: Sequence[FrameKey]) -> list[FrameKey]:

@@ -121,7 +121,8 @@ def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None
     if frames is None or labels is None:
         raise InvalidInputError("--frames and --labels belong together; give both")
     from vehicle_detection.datasets import load_frames
-    from vehicle_detection.evaluation import LabelledFrames, read_labels
+    from vehicle_detection.evaluation import LabelledFrames
+    from vehicle_detection.formats import read_labels
 
     return LabelledFrames(frames.name or "frames", load_frames(frames), read_labels(labels), horizon)
 

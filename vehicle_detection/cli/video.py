@@ -95,7 +95,7 @@ def _check(options: VideoOptions) -> None:
     """Refuse options that do not fit each other, and a run without any output."""
     from vehicle_detection._common import check_suffix
     from vehicle_detection.camera import LENSES
-    from vehicle_detection.export import FORMATS
+    from vehicle_detection.formats import FORMATS
 
     files = options.files()
     sources = {"SOURCE": Path(options.source)} | ({} if options.gpx is None else {"--gpx": options.gpx})

@@ -76,7 +76,7 @@ class SideOutputs:
     ) -> Iterator[list[Callable[[Any], object]]]:
         """Yield functions that take each frame's result; the file of tracks is complete after the block."""
         from vehicle_detection.drive import ReportWriter
-        from vehicle_detection.export import TrackWriter
+        from vehicle_detection.formats import open_tracks
         from vehicle_detection.tables import TrackTable
 
         options = self._options
@@ -98,7 +98,7 @@ class SideOutputs:
         with contextlib.ExitStack() as stack:
             if options.tracks is not None:
                 with option_names(path="--tracks"):
-                    table = TrackWriter(options.tracks, shape=source.info.shape, fps=float(source.info.fps))
+                    table = open_tracks(options.tracks, shape=source.info.shape, fps=float(source.info.fps))
                     writers.append(stack.enter_context(table))
             yield writers
 

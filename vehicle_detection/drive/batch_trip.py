@@ -33,7 +33,7 @@ from vehicle_detection.errors import (
     VehicleDetectionError,
     VideoError,
 )
-from vehicle_detection.export import DIGITS, TRACK_COLUMNS, track_rows
+from vehicle_detection.formats import DIGITS, track_records
 from vehicle_detection.video import FrameSource, download, open_source, process_video
 
 BUSY = "busy"
@@ -238,8 +238,9 @@ class _TrackTable(ParquetRows):
 
     def __call__(self, result: Any) -> None:
         """Add the shown tracks of a frame's result."""
-        for row in track_rows(result):
-            self.write((self._key, row.frame, round(result.time, 4), *row[1 : len(TRACK_COLUMNS)]))
+        for record in track_records(result):
+            time = round(result.time, 4)
+            self.write([{"trip": self._key, "time_s": time, **record}[name] for name in _COLUMNS])
             self.rows += 1
 
 

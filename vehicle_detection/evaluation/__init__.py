@@ -8,19 +8,13 @@ from vehicle_detection.evaluation.detections import (
     evaluate_detections,
     precision_recall_curve,
 )
-from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey, match_names
 from vehicle_detection.evaluation.labelled_frames import Frames, LabelledFrames, keyed_frames
 from vehicle_detection.evaluation.matching import DetectionMatches, match_detections, prepare_evaluation
-from vehicle_detection.evaluation.readers import read_labels
 from vehicle_detection.evaluation.tracks import TrackScores, evaluate_tracks
-from vehicle_detection.evaluation.writers import write_labels
 
 __all__ = [
-    "NO_TRACK",
     "DetectionMatches",
     "DetectionScores",
-    "FrameBoxes",
-    "FrameKey",
     "Frames",
     "LabelledFrames",
     "Platt",
@@ -32,9 +26,6 @@ __all__ = [
     "evaluate_tracks",
     "keyed_frames",
     "match_detections",
-    "match_names",
     "precision_recall_curve",
     "prepare_evaluation",
-    "read_labels",
-    "write_labels",
 ]

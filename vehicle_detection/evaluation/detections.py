@@ -22,8 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_flags, check_number
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.frame_boxes import FrameBoxes, FrameKey
 from vehicle_detection.evaluation.matching import DetectionMatches, match_detections, prepare_evaluation
+from vehicle_detection.tables import FrameKey, TrackTable
 
 SIZES = {"small": (0.0, 64.0), "medium": (64.0, 128.0), "large": (128.0, math.inf)}
 """Half-open ranges of box width in pixels."""
@@ -143,8 +143,8 @@ class DetectionScores(Scores):
 
 
 def evaluate_detections(
-    predictions: FrameBoxes,
-    labels: FrameBoxes,
+    predictions: TrackTable,
+    labels: TrackTable,
     *,
     iou: float = 0.5,
     frames: Sequence[FrameKey] | None = None,
@@ -177,13 +177,13 @@ def evaluate_detections(
     Raises
     ------
     InvalidInputError
-        If an argument is not `FrameBoxes`, `iou` is out of range, a prediction is in none of the `frames`, or
+        If an argument is not `TrackTable`, `iou` is out of range, a prediction is in none of the `frames`, or
         the names of the same frames are not unique without their folders and suffixes.
 
     Examples
     --------
-    >>> labels = FrameBoxes([0, 0], [1, 2], [[0, 0, 50, 40], [200, 0, 290, 60]])
-    >>> found = FrameBoxes([0, 0], None, [[1, 0, 51, 40], [400, 0, 450, 40]], scores=[2.0, 0.5])
+    >>> labels = TrackTable([0, 0], [1, 2], [[0, 0, 50, 40], [200, 0, 290, 60]])
+    >>> found = TrackTable([0, 0], None, [[1, 0, 51, 40], [400, 0, 450, 40]], score=[2.0, 0.5])
     >>> scores = evaluate_detections(found, labels)
     >>> scores.precision, scores.recall, scores.average_precision
     (0.5, 0.5, 0.5)
@@ -217,7 +217,7 @@ def evaluate_detections(
 
 
 def precision_recall_curve(
-    predictions: FrameBoxes, labels: FrameBoxes, *, iou: float = 0.5, ignored_as_regions: bool = False
+    predictions: TrackTable, labels: TrackTable, *, iou: float = 0.5, ignored_as_regions: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Precision and recall for every threshold on the detections' scores.
 
@@ -239,15 +239,15 @@ def precision_recall_curve(
 
     Examples
     --------
-    >>> labels = FrameBoxes([0, 0], [1, 2], [[0, 0, 50, 40], [200, 0, 290, 60]])
-    >>> found = FrameBoxes([0, 0], None, [[0, 0, 50, 40], [400, 0, 450, 40]], scores=[2.0, 0.5])
+    >>> labels = TrackTable([0, 0], [1, 2], [[0, 0, 50, 40], [200, 0, 290, 60]])
+    >>> found = TrackTable([0, 0], None, [[0, 0, 50, 40], [400, 0, 450, 40]], score=[2.0, 0.5])
     >>> precision_recall_curve(found, labels)
     (array([1. , 0.5]), array([0.5, 0.5]), array([2. , 0.5]))
     """
     check_flags(ignored_as_regions=ignored_as_regions)
     predictions, labels, keys = prepare_evaluation(predictions, labels, None)
-    if len(predictions) and predictions.scores is None:
-        raise InvalidInputError("predictions need scores for a curve; pass FrameBoxes with scores=")
+    if len(predictions) and "score" not in predictions.columns:
+        raise InvalidInputError("predictions need scores for a curve; pass a TrackTable with score=")
     min_iou = check_number(iou, "iou", above=0, high=1)
     found = match_detections(predictions, labels, keys, min_iou, ignored_as_regions=ignored_as_regions)
     return _curve(predictions, found)
@@ -267,14 +267,14 @@ def best_f1(
 
 
 def _curve(
-    predictions: FrameBoxes, found: DetectionMatches
+    predictions: TrackTable, found: DetectionMatches
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Precision, recall and threshold for every distinct score, highest first.
 
     A greedy match depends on higher scores only, so one matching serves all thresholds.
     """
     scored = np.flatnonzero(~found.ignored)
-    scores = np.zeros(len(scored)) if predictions.scores is None else predictions.scores[scored]
+    scores = np.nan_to_num(predictions["score"][scored])  # without scores, all are equal
     order = np.argsort(-scores, kind="stable")
     hits = np.cumsum(found.match[scored][order] >= 0)
     last = np.flatnonzero(np.diff(scores[order], append=-np.inf))

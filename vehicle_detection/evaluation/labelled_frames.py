@@ -20,7 +20,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.frame_boxes import FrameBoxes, FrameKey, match_names
+from vehicle_detection.tables import FrameKey, TrackTable, match_names
 
 Frames = Mapping[FrameKey, NDArray[np.uint8]] | FrameSet | Sequence[NDArray[np.uint8]]
 """Images by key, a `FrameSet`, or a list of images that are numbered from 0."""
@@ -57,14 +57,14 @@ class LabelledFrames:
 
     Examples
     --------
-    >>> labels = FrameBoxes([0], None, [[10, 10, 60, 50]])
+    >>> labels = TrackTable([0], None, [[10, 10, 60, 50]])
     >>> LabelledFrames("road", [np.zeros((90, 120, 3), np.uint8)], labels)
     LabelledFrames('road', 1 frame, 1 box)
     """
 
     name: str
     frames: Mapping[FrameKey, NDArray[np.uint8]] | FrameSet
-    labels: FrameBoxes
+    labels: TrackTable
     horizon: float | None = None
 
     def __post_init__(self) -> None:
@@ -75,7 +75,7 @@ class LabelledFrames:
         keys, labels = self.keys, self.labels
         if not keys:
             raise InvalidInputError("frames must hold at least one image, got none")
-        check_type(labels, "labels", FrameBoxes, "read a file with read_labels")
+        check_type(labels, "labels", TrackTable, "read a file with read_labels")
         labels = match_names(labels, keys, ("labels", "frames"))
         if labels.frame_keys and not set(keys) & set(labels.frame_keys):
             raise InvalidInputError(
@@ -84,7 +84,7 @@ class LabelledFrames:
             )
         if self.horizon is not None:
             store_number(self, "horizon", low=0, high=1)
-        object.__setattr__(self, "labels", labels[sorted(row for key in keys for row in labels.rows(key))])
+        object.__setattr__(self, "labels", labels.select(keys))
 
     def __repr__(self) -> str:
         frames, boxes = pluralize(len(self), "frame"), pluralize(len(self.labels), "box", "es")
@@ -106,7 +106,7 @@ class LabelledFrames:
     def from_video(
         cls,
         path: str | os.PathLike[str],
-        labels: FrameBoxes,
+        labels: TrackTable,
         *,
         every: int = 1,
         name: str | None = None,

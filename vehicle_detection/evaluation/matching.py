@@ -12,27 +12,20 @@ from numpy.typing import NDArray
 from vehicle_detection._common import describe
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.frame_boxes import (
-    NO_TRACK,
-    FrameBoxes,
-    FrameKey,
-    check_keys,
-    frame_order,
-    match_names,
-)
+from vehicle_detection.tables import NO_TRACK, FrameKey, TrackTable, check_keys, frame_order, match_names
 
 
 def prepare_evaluation(
-    predictions: FrameBoxes, labels: FrameBoxes, frames: Sequence[FrameKey] | None
-) -> tuple[FrameBoxes, FrameBoxes, list[FrameKey]]:
+    predictions: TrackTable, labels: TrackTable, frames: Sequence[FrameKey] | None
+) -> tuple[TrackTable, TrackTable, list[FrameKey]]:
     """Check both sides, drop the predictions marked ``ignore``, and list the frames in order."""
     for name, side in (("predictions", predictions), ("labels", labels)):
-        if not isinstance(side, FrameBoxes):
+        if not isinstance(side, TrackTable):
             raise InvalidInputError(
-                f"{name} must be FrameBoxes, got {describe(side)}; read a file with read_labels or convert "
-                "the Detections of each frame with FrameBoxes.from_detections"
+                f"{name} must be a TrackTable, got {describe(side)}; read a file with read_labels or convert "
+                "the Detections of each frame with TrackTable.from_detections"
             )
-    predictions = predictions[~predictions.ignore]
+    predictions = predictions[~predictions["ignore"]]
     predictions = match_names(predictions, labels.frame_keys, ("predictions", "labels"))
     given = None if frames is None else check_keys(frames, "frames")
     sides = {"predictions": predictions.frame_keys, "labels": labels.frame_keys, "frames": given or ()}
@@ -47,7 +40,7 @@ def prepare_evaluation(
     for key, count in Counter(given).items():
         if count > 1:
             raise InvalidInputError(f"frames must differ, got {key!r} more than once; list each frame once")
-    unknown = set(predictions.frames) - set(given)
+    unknown = set(predictions["frame"].tolist()) - set(given)
     if unknown:
         raise InvalidInputError(
             f"predictions hold frame {min(unknown, key=frame_order)!r}, which is not among the {len(given)} "
@@ -59,7 +52,7 @@ def prepare_evaluation(
 
 def find_ignored(
     boxes: NDArray[np.float64],
-    labels: FrameBoxes,
+    labels: TrackTable,
     rows: NDArray[np.intp],
     min_iou: float,
     *,
@@ -69,8 +62,8 @@ def find_ignored(
 
     With `as_regions` also those of which at least half lies in an ignored box.
     """
-    ignored = rows[labels.ignore[rows]]
-    regions = labels.boxes[ignored[labels.tracks[ignored] == NO_TRACK]]
+    ignored = rows[labels["ignore"][rows]]
+    regions = labels.boxes[ignored[labels["track_id"][ignored] == NO_TRACK]]
     center = (boxes[:, :2] + boxes[:, 2:]) / 2
     inside = (regions[:, :2] <= center[:, None]) & (center[:, None] < regions[:, 2:])
     covers = iou_matrix(boxes, labels.boxes[ignored]) >= min_iou
@@ -96,8 +89,8 @@ class DetectionMatches:
 
 
 def match_detections(
-    predictions: FrameBoxes,
-    labels: FrameBoxes,
+    predictions: TrackTable,
+    labels: TrackTable,
     keys: Sequence[FrameKey],
     min_iou: float,
     *,
@@ -105,12 +98,12 @@ def match_detections(
 ) -> DetectionMatches:
     """Match each frame of `keys` greedily by score, then find the unmatched predictions to be ignored."""
     count = len(predictions)
-    scores = np.zeros(count) if predictions.scores is None else predictions.scores
+    scores, ignore = np.nan_to_num(predictions["score"]), labels["ignore"]
     match, iou, ignored = np.full(count, -1, np.intp), np.zeros(count), np.zeros(count, np.bool_)
     usable: list[int] = []
     for key in keys:
         here, rows = predictions.rows(key), labels.rows(key)
-        targets = rows[~labels.ignore[rows]]
+        targets = rows[~ignore[rows]]
         usable += targets.tolist()
         overlaps = iou_matrix(predictions.boxes[here], labels.boxes[targets])
         best = overlaps.max(axis=1, initial=0)

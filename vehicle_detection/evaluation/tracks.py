@@ -14,9 +14,9 @@ from vehicle_detection._common import check_flags, check_number
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.detections import Scores, format_number, format_summary, mean, rates, ratio
-from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey
 from vehicle_detection.evaluation.hota import Overlaps, hota_scores
 from vehicle_detection.evaluation.matching import find_ignored, prepare_evaluation
+from vehicle_detection.tables import NO_TRACK, FrameKey, TrackTable
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,8 @@ class TrackScores(Scores):
 
 
 def evaluate_tracks(
-    predictions: FrameBoxes,
-    labels: FrameBoxes,
+    predictions: TrackTable,
+    labels: TrackTable,
     *,
     iou: float = 0.5,
     frames: Sequence[FrameKey] | None = None,
@@ -132,8 +132,8 @@ def evaluate_tracks(
 
     Examples
     --------
-    >>> labels = FrameBoxes([0, 1, 2], [1, 1, 1], [[0, 0, 50, 40], [4, 0, 54, 40], [8, 0, 58, 40]])
-    >>> found = FrameBoxes([0, 1, 2], [7, 7, 8], [[0, 0, 50, 40], [5, 0, 55, 40], [9, 0, 59, 40]])
+    >>> labels = TrackTable([0, 1, 2], [1, 1, 1], [[0, 0, 50, 40], [4, 0, 54, 40], [8, 0, 58, 40]])
+    >>> found = TrackTable([0, 1, 2], [7, 7, 8], [[0, 0, 50, 40], [5, 0, 55, 40], [9, 0, 59, 40]])
     >>> scores = evaluate_tracks(found, labels)
     >>> scores.id_switches, round(scores.mota, 3), round(scores.hota, 3), scores.jitter
     (1, 0.667, 0.745, 0.25)
@@ -153,9 +153,9 @@ def evaluate_tracks(
     histories: dict[int, list[int | None]] = defaultdict(list)
     for frame in matched:
         for target, row, _ in frame.pairs:
-            histories[int(labels.tracks[target])].append(int(predictions.tracks[row]))
+            histories[int(labels["track_id"][target])].append(int(predictions["track_id"][row]))
         for target in frame.missed:
-            histories[int(labels.tracks[target])].append(None)
+            histories[int(labels["track_id"][target])].append(None)
     switches = fragmentations = 0
     for history in histories.values():
         tracks = [track for track in history if track is not None]
@@ -166,7 +166,7 @@ def evaluate_tracks(
         frames=len(keys),
         iou=min_iou,
         vehicles=len(histories),
-        tracks=len(np.unique(predictions.tracks[found_rows + false_rows])),
+        tracks=len(np.unique(predictions["track_id"][found_rows + false_rows])),
         ignored=sum(frame.ignored for frame in matched),
         mean_iou=mean(overlaps),
         jitter=_jitter(predictions, labels, matched),
@@ -192,27 +192,28 @@ class _MatchedFrame:
     overlapping: list[tuple[int, int]]  # vehicle and track of every pair that overlaps enough, matched or not
 
 
-def _overlaps(predictions: FrameBoxes, labels: FrameBoxes, frame: _MatchedFrame) -> Overlaps:
+def _overlaps(predictions: TrackTable, labels: TrackTable, frame: _MatchedFrame) -> Overlaps:
     """Collect the boxes of a frame that count."""
     targets = np.array(sorted([*(target for target, *_ in frame.pairs), *frame.missed]), np.intp)
     rows = np.array(sorted([*(row for _, row, _ in frame.pairs), *frame.false]), np.intp)
     iou = iou_matrix(labels.boxes[targets], predictions.boxes[rows])
-    return Overlaps(labels.tracks[targets], predictions.tracks[rows], iou)
+    return Overlaps(labels["track_id"][targets], predictions["track_id"][rows], iou)
 
 
-def _check_tracks(side: FrameBoxes, name: str, keys: list[FrameKey]) -> None:
+def _check_tracks(side: TrackTable, name: str, keys: list[FrameKey]) -> None:
     wanted = set(keys)
-    for row in np.flatnonzero((side.tracks == NO_TRACK) & ~side.ignore).tolist():
-        if side.frames[row] in wanted:
+    for row in np.flatnonzero((side["track_id"] == NO_TRACK) & ~side["ignore"]).tolist():
+        frame = side["frame"].tolist()[row]
+        if frame in wanted:
             raise InvalidInputError(
-                f"{name} must have a track for every box, row {row} in frame {side.frames[row]!r} has none; "
+                f"{name} must have a track for every box, row {row} in frame {frame!r} has none; "
                 "score boxes without tracks with evaluate_detections"
             )
 
 
 def _match_tracks(
-    predictions: FrameBoxes,
-    labels: FrameBoxes,
+    predictions: TrackTable,
+    labels: TrackTable,
     keys: list[FrameKey],
     min_iou: float,
     ignored_as_regions: bool,
@@ -222,9 +223,9 @@ def _match_tracks(
     matched: list[_MatchedFrame] = []
     for key, position in zip(keys, _positions(keys)):
         here, rows = predictions.rows(key), labels.rows(key)
-        targets = rows[~labels.ignore[rows]]
+        targets = rows[~labels["ignore"][rows]]
         overlap = iou_matrix(labels.boxes[targets], predictions.boxes[here])
-        vehicles, tracks = labels.tracks[targets].tolist(), predictions.tracks[here].tolist()
+        vehicles, tracks = labels["track_id"][targets].tolist(), predictions["track_id"][here].tolist()
 
         kept: list[tuple[int, int]] = []
         for i, vehicle in enumerate(vehicles):
@@ -303,7 +304,7 @@ def _identity_true_positives(matched: list[_MatchedFrame]) -> int:
     return total
 
 
-def _jitter(predictions: FrameBoxes, labels: FrameBoxes, matched: list[_MatchedFrame]) -> float:
+def _jitter(predictions: TrackTable, labels: TrackTable, matched: list[_MatchedFrame]) -> float:
     """Mean absolute change of the edge errors, over vehicles that are matched in two consecutive frames.
 
     Errors are followed by vehicle, so the jump to another track's box counts as jitter.
@@ -312,7 +313,7 @@ def _jitter(predictions: FrameBoxes, labels: FrameBoxes, matched: list[_MatchedF
     before: dict[int, tuple[int, NDArray[np.float64]]] = {}
     for frame in matched:
         for target, row, _ in frame.pairs:
-            vehicle, error = int(labels.tracks[target]), predictions.boxes[row] - labels.boxes[target]
+            vehicle, error = int(labels["track_id"][target]), predictions.boxes[row] - labels.boxes[target]
             position, last = before.get(vehicle, (-2, error))
             if position == frame.position - 1:
                 changes.append(np.abs(error - last))
@@ -320,11 +321,11 @@ def _jitter(predictions: FrameBoxes, labels: FrameBoxes, matched: list[_MatchedF
     return mean(changes)
 
 
-def _longest_false_run(predictions: FrameBoxes, matched: list[_MatchedFrame]) -> int:
+def _longest_false_run(predictions: TrackTable, matched: list[_MatchedFrame]) -> int:
     longest = 0
     runs: dict[int, tuple[int, int]] = {}
     for frame in matched:
-        for track in predictions.tracks[frame.false].tolist():
+        for track in predictions["track_id"][frame.false].tolist():
             position, length = runs.get(track, (-2, 0))
             runs[track] = frame.position, length + 1 if position == frame.position - 1 else 1
             longest = max(longest, runs[track][1])

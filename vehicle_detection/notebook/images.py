@@ -88,7 +88,7 @@ def show_images(
         ``(H, W, 3)`` uint8 RGB, or ``(H, W)`` numbers, shown in gray; and one title per image, by default the
         keys if `images` is a mapping.
     boxes, truth
-        Boxes to draw on each image, or None: `Detections`, `FrameBoxes` or ``(N, 4)``; and labelled boxes in
+        Boxes to draw on each image, or None: `Detections`, `TrackTable` or ``(N, 4)``; and labelled boxes in
         the same form, drawn with dashed lines.
     columns
         Images per row; None for up to three.

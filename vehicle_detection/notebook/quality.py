@@ -22,8 +22,6 @@ from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import (
     DetectionScores,
-    FrameBoxes,
-    FrameKey,
     LabelledFrames,
     best_f1,
     match_detections,
@@ -31,6 +29,7 @@ from vehicle_detection.evaluation import (
 )
 from vehicle_detection.notebook import style
 from vehicle_detection.notebook.style import LINE_COLORS, OTHER, SKY, TRUTH, VEHICLE, VERMILION, Image
+from vehicle_detection.tables import FrameKey, TrackTable
 from vehicle_detection.training import check_column, numeric_column, pareto_front
 
 if TYPE_CHECKING:
@@ -179,7 +178,7 @@ def plot_f1(
     Examples
     --------
     >>> from vehicle_detection import evaluate_detections
-    >>> labels = FrameBoxes([0], None, [[0, 0, 50, 40]])
+    >>> labels = TrackTable([0], None, [[0, 0, 50, 40]])
     >>> axes = plot_f1({"road": evaluate_detections(labels, labels)})
     >>> [text.get_text() for text in axes.texts]
     ['1.00']
@@ -213,7 +212,7 @@ def plot_f1(
 
 def plot_errors(
     frames: LabelledFrames,
-    predictions: FrameBoxes,
+    predictions: TrackTable,
     *,
     kind: Literal["missed", "false"] = "missed",
     iou: float = 0.5,
@@ -228,7 +227,7 @@ def plot_errors(
     Parameters
     ----------
     frames, predictions
-        Frames with their true boxes; and predicted boxes with scores, as `FrameBoxes.from_detections` makes.
+        Frames with their true boxes; and predicted boxes with scores, as `TrackTable.from_detections` makes.
     kind
         ``"missed"``: labelled vehicles without a detection, largest first, with the largest IoU of any
         detection. ``"false"``: detections without a labelled vehicle, highest score first.
@@ -237,9 +236,9 @@ def plot_errors(
 
     Examples
     --------
-    >>> labels = FrameBoxes([0], None, [[10, 10, 60, 50]])
+    >>> labels = TrackTable([0], None, [[10, 10, 60, 50]])
     >>> frames = LabelledFrames("road", [np.zeros((90, 120, 3), np.uint8)], labels)
-    >>> plot_errors(frames, FrameBoxes([], None, [], scores=[])).get_title()
+    >>> plot_errors(frames, TrackTable(score=[])).get_title()
     '1 of 1 vehicles missed'
     """
     check_type(frames, "frames", LabelledFrames, "pass LabelledFrames(name, frames, labels)")
@@ -253,10 +252,10 @@ def plot_errors(
         title = f"{len(rows):,} of {len(matches.usable):,} vehicles missed"
     else:
         side, rows = predictions, np.flatnonzero((matches.match < 0) & ~matches.ignored)
-        importance = np.zeros(len(side)) if side.scores is None else side.scores
+        importance = np.nan_to_num(side["score"])
         title = f"{len(rows):,} of {len(predictions):,} detections are false positives"
     shown = rows[np.argsort(-importance[rows], kind="stable")[:max_count]].tolist()
-    crops = [_crop(frames, side.frames[row], side.boxes[row]) for row in shown]
+    crops = [_crop(frames, side["frame"][row], side.boxes[row]) for row in shown]
     captions = [_caption(side, row, predictions, kind) for row in shown]
     tiles = [(image, caption) for (image, _), caption in zip(crops, captions)]
     axes, places = style.add_tiles(ax, tiles, columns=columns, inches=1.9, caption_lines=2)
@@ -264,8 +263,8 @@ def plot_errors(
     entries = [("labelled", "0.6", "--"), ("detected", SKY, "-"), ("false positive", VERMILION, "-")]
     entries = entries[: 2 if kind == "missed" else 3]
     for row, (image, corner), (left, top, pixel) in zip(shown, crops, places):
-        true, found = labels.frame(side.frames[row]), predictions.frame(side.frames[row])
-        layers = (true.boxes[~true.ignore], found.boxes, side.boxes[[row]])
+        true, found = labels.frame(side["frame"][row]), predictions.frame(side["frame"][row])
+        layers = (true.boxes[~true["ignore"]], found.boxes, side.boxes[[row]])
         for boxes, color, (_, _, linestyle) in zip(layers, (TRUTH, SKY, VERMILION), entries):
             clipped = clip_boxes(boxes - np.tile(corner, 2), image.shape)
             clipped = clipped[(clipped[:, 2:] - clipped[:, :2] >= 2).all(axis=1)]
@@ -290,17 +289,17 @@ def _crop(frames: LabelledFrames, key: FrameKey, box: NDArray[Any]) -> tuple[Ima
     return image[y1 : max(y2, y1 + 1), x1 : max(x2, x1 + 1)], (x1, y1)
 
 
-def _caption(side: FrameBoxes, row: int, predictions: FrameBoxes, kind: str) -> str:
+def _caption(side: TrackTable, row: int, predictions: TrackTable, kind: str) -> str:
     """Frame, size of the box, and its best IoU or its score."""
-    key = side.frames[row]
+    key = side["frame"][row]
     name = str(key).rpartition(".")[0] or str(key) if isinstance(key, str) else f"frame {key}"
     width, height = (side.boxes[row, 2:] - side.boxes[row, :2]).round().astype(int)
     text = f"{width}x{height} px"
     if kind == "missed":
         overlaps = iou_matrix(side.boxes[[row]], predictions.frame(key).boxes)
         text += f", IoU {overlaps.max(initial=0):.2f}"
-    elif side.scores is not None:
-        text = f"score {side.scores[row]:.2f}, {text}"
+    elif "score" in side.columns:
+        text = f"score {side['score'][row]:.2f}, {text}"
     return f"{name if len(name) <= 24 else '...' + name[-21:]}\n{text}"
 
 

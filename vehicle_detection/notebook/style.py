@@ -24,7 +24,7 @@ from vehicle_detection._common import (
 from vehicle_detection.boxes import Detections
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes
+from vehicle_detection.tables import TrackTable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 FigureLike: TypeAlias = Union["Figure", "SubFigure"]
 Image = NDArray[np.uint8]
-Boxes = Detections | FrameBoxes | ArrayLike
+Boxes = Detections | TrackTable | ArrayLike
 Color = tuple[float, float, float]
 
 COLORS: tuple[Color, ...] = tuple((r / 255, g / 255, b / 255) for r, g, b in TRACK_COLORS)
@@ -190,11 +190,11 @@ def split_titles(images: object, titles: Sequence[str] | None = None) -> tuple[l
 
 
 def box_array(boxes: Boxes, name: str = "boxes") -> NDArray[Any]:
-    """Boxes as ``(N, 4)``; ignored boxes of `FrameBoxes` are left out."""
+    """Boxes as ``(N, 4)``; ignored boxes of `TrackTable` are left out."""
     if isinstance(boxes, Detections):
         return boxes.boxes
-    if isinstance(boxes, FrameBoxes):
-        return boxes.boxes[~boxes.ignore]
+    if isinstance(boxes, TrackTable):
+        return np.asarray(boxes.boxes[~boxes["ignore"]])
     return check_boxes(boxes, name)
 
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from vehicle_detection._common import Floats, check_number, check_type, describe
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import NO_TRACK, FrameBoxes
 from vehicle_detection.notebook import style
 from vehicle_detection.notebook.style import COLORS, LINESTYLES, YELLOW, FigureLike
 from vehicle_detection.scenes import VehicleTruth
+from vehicle_detection.tables import NO_TRACK, TrackTable
 from vehicle_detection.tracking import FrameResult
 from vehicle_detection.video import VideoReport
 
@@ -44,9 +44,9 @@ Row = tuple[int, float, Any, float | None, float | None, float | None, float | N
 
 
 def plot_tracks(
-    results: Iterable[FrameResult] | FrameBoxes,
+    results: Iterable[FrameResult] | TrackTable,
     *,
-    truth: FrameBoxes | Sequence[Sequence[VehicleTruth]] | None = None,
+    truth: TrackTable | Sequence[Sequence[VehicleTruth]] | None = None,
     fps: float = 25.0,
     min_frames: int = 1,
     figure: FigureLike | None = None,
@@ -69,13 +69,13 @@ def plot_tracks(
     Examples
     --------
     >>> boxes = [[10.0 + frame, 20.0, 60.0 + frame, 60.0] for frame in range(5)]
-    >>> figure = plot_tracks(FrameBoxes(range(5), [1] * 5, boxes), fps=10)
+    >>> figure = plot_tracks(TrackTable(range(5), [1] * 5, boxes), fps=10)
     >>> figure.axes[0].lines[0].get_xydata()[-1].tolist()
     [0.4, 39.0]
     """
     rate = check_number(fps, "fps", above=0, high=1e6)
     shortest = check_number(min_frames, "min_frames", low=1)
-    if isinstance(results, FrameBoxes):
+    if isinstance(results, TrackTable):
         tracks = _split_tracks(_rows_of_boxes(results, rate, "results"))
     else:
         tracks = _split_tracks(_rows_of_results(results, rate))
@@ -114,7 +114,7 @@ def plot_tracks(
 def _rows_of_results(results: object, rate: float) -> Iterator[Row]:
     if not isinstance(results, Iterable):
         raise InvalidInputError(
-            f"results must be the FrameResult of each frame, or FrameBoxes; got {describe(results)}; "
+            f"results must be the FrameResult of each frame, or TrackTable; got {describe(results)}; "
             "collect what detector.process returns"
         )
     for result in results:
@@ -125,25 +125,23 @@ def _rows_of_results(results: object, rate: float) -> Iterator[Row]:
             yield track.id, time, track.box, track.distance_m, track.speed_mps, *stds
 
 
-def _rows_of_boxes(labels: FrameBoxes, rate: float, name: str) -> Iterator[Row]:
+def _rows_of_boxes(labels: TrackTable, rate: float, name: str) -> Iterator[Row]:
     if any(isinstance(key, str) for key in labels.frame_keys):
         raise InvalidInputError(
             f"{name} must have numbered frames, got names such as {labels.frame_keys[0]!r}; "
-            "convert them with FrameBoxes.renamed"
+            "convert them with TrackTable.renamed"
         )
-    unknown = [None] * len(labels)
-    distances = unknown if labels.distance_m is None else labels.distance_m
-    speeds = unknown if labels.speed_mps is None else labels.speed_mps
-    times = np.array(labels.frames, np.float64) / rate
+    tracks, distances, speeds = (labels[column] for column in ("track_id", "distance_m", "speed_mps"))
+    times = labels["frame"] / rate
     for row in np.argsort(times, kind="stable"):
-        if labels.tracks[row] != NO_TRACK:
-            yield labels.tracks[row], times[row], labels.boxes[row], distances[row], speeds[row], None, None
+        if tracks[row] != NO_TRACK:
+            yield tracks[row], times[row], labels.boxes[row], distances[row], speeds[row], None, None
 
 
 def _rows_of_truth(truth: object, rate: float) -> Iterator[Row]:
     """Rows of the true boxes that are not ignored, from labels or the truth of a rendered drive."""
-    if isinstance(truth, FrameBoxes):
-        yield from _rows_of_boxes(truth[~truth.ignore], rate, "truth")
+    if isinstance(truth, TrackTable):
+        yield from _rows_of_boxes(truth[~truth["ignore"]], rate, "truth")
         return
     given = isinstance(truth, Sequence) and all(isinstance(each, Sequence) for each in truth)
     frames: Any = truth if given else [[truth]]
@@ -151,7 +149,7 @@ def _rows_of_truth(truth: object, rate: float) -> Iterator[Row]:
         for row in rows:
             if not isinstance(row, VehicleTruth):
                 raise InvalidInputError(
-                    f"truth must be FrameBoxes or the truth of a rendered drive, got {describe(truth)}; "
+                    f"truth must be TrackTable or the truth of a rendered drive, got {describe(truth)}; "
                     "read a file with read_labels or pass drive.truth"
                 )
             if not row.ignore:

@@ -17,8 +17,9 @@ import numpy as np
 
 from vehicle_detection._common import check_choice, check_integer, check_path, pluralize
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import FrameKey, LabelledFrames
+from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.network import NetworkModel, load_network
+from vehicle_detection.tables import FrameKey
 from vehicle_detection.training.export import export_network, set_metadata
 from vehicle_detection.training.frames import (
     FrameDataset,
@@ -187,7 +188,7 @@ def hold_out(sources: Sequence[FrameDataset]) -> tuple[list[FrameDataset], list[
         If no frame has a vehicle.
     """
     parts = [(source, part) for source in sources for part in source.sets]
-    if not any((~part.labels.ignore).any() for _, part in parts):
+    if not any((~part.labels["ignore"]).any() for _, part in parts):
         raise InvalidInputError(
             "sources must show at least one vehicle, got labels of "
             f"{pluralize(sum(len(part) for _, part in parts), 'frame')} without any; add frames with vehicles"
@@ -197,7 +198,7 @@ def hold_out(sources: Sequence[FrameDataset]) -> tuple[list[FrameDataset], list[
         chosen[-1] = {parts[-1][1].keys[-1]}
     kept = [[key for key in part.keys if key not in held] for (_, part), held in zip(parts, chosen)]
     if not any(
-        (~part.labels.frame(key).ignore).any() for (_, part), keys in zip(parts, kept) for key in keys
+        (~part.labels.frame(key)["ignore"]).any() for (_, part), keys in zip(parts, kept) for key in keys
     ):
         return list(sources), []
     held_out = [[key for key in part.keys if key in held] for (_, part), held in zip(parts, chosen)]
@@ -233,7 +234,7 @@ def fingerprint(sources: Sequence[FrameDataset]) -> str:
             for key in part.keys:
                 labels = part.labels.frame(key)
                 digest.update(f"{source.name}/{part.name}/{key}\n".encode())
-                digest.update(np.column_stack([labels.boxes, labels.ignore]).round(3).tobytes())
+                digest.update(np.column_stack([labels.boxes, labels["ignore"]]).round(3).tobytes())
     return digest.hexdigest()
 
 

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check_integer, check_type, describe, pluralize
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, FrameKey, LabelledFrames, read_labels
+from vehicle_detection.evaluation import LabelledFrames
+from vehicle_detection.formats import read_labels
+from vehicle_detection.tables import FrameKey, TrackTable, match_names
 from vehicle_detection.video import is_video_file, probe_video, read_frames
 
 _LABEL_SUFFIXES = (".csv", ".json", ".jsonl", ".parquet")
@@ -41,8 +43,8 @@ class FrameDataset:
 
     Examples
     --------
-    >>> from vehicle_detection.evaluation import FrameBoxes
-    >>> labels = FrameBoxes([0], None, [[9, 9, 60, 50]])
+    >>> from vehicle_detection.tables import TrackTable
+    >>> labels = TrackTable([0], None, [[9, 9, 60, 50]])
     >>> road = LabelledFrames("road", [np.zeros((90, 120, 3), np.uint8)], labels)
     >>> FrameDataset("camera", [road]).sets
     (LabelledFrames('road', 1 frame, 1 box),)
@@ -92,9 +94,7 @@ def select_frames(part: LabelledFrames, keys: Collection[FrameKey]) -> LabelledF
         chosen: Any = {key: image for key, image in frames.items() if key in keys}
     else:
         chosen = replace(frames, names=tuple(name for name in frames.names if name in keys))
-    rows = sorted(row for key in keys for row in part.labels.rows(key).tolist())
-    labels = replace(part.labels[rows], frame_keys=tuple(key for key in part.keys if key in keys))
-    return replace(part, frames=chosen, labels=labels)
+    return replace(part, frames=chosen)
 
 
 def find_sources(folder: str | os.PathLike[str], *, clip_rate: float = 3.0) -> list[FrameDataset]:
@@ -137,7 +137,7 @@ def _read_frames(root: Path, file: Path, clip_rate: float) -> LabelledFrames:
     for folder in folders:
         if folder.is_dir():
             found = LabelledFrames(name, load_frames(folder), labels)
-            named = found.labels.frame_keys  # those of the labels, by the names of the images
+            named = match_names(labels, found.keys, ("labels", "frames")).frame_keys
             absent = sorted(set(named) - set(found.keys), key=str)
             if absent:
                 log.warning(
@@ -152,7 +152,7 @@ def _read_frames(root: Path, file: Path, clip_rate: float) -> LabelledFrames:
     raise DatasetError(f"{file} has no frames: add {folders[0]}, {folders[1]} or {video}")
 
 
-def _frames_of_video(video: Path, labels: FrameBoxes, clip_rate: float) -> LabelledFrames:
+def _frames_of_video(video: Path, labels: TrackTable, clip_rate: float) -> LabelledFrames:
     """Take some frames per second of a video: all of them if most are labelled, or else labelled ones.
 
     Where most frames are labelled, the others show no vehicle.
@@ -201,8 +201,8 @@ def load_training_frames(
 
     Examples
     --------
-    >>> from vehicle_detection.evaluation import FrameBoxes
-    >>> labels = FrameBoxes([0], None, [[8, 8, 60, 50]])
+    >>> from vehicle_detection.tables import TrackTable
+    >>> labels = TrackTable([0], None, [[8, 8, 60, 50]])
     >>> road = LabelledFrames("road", [np.zeros((90, 120, 3), np.uint8)], labels)
     >>> (frame,) = load_training_frames([FrameDataset("camera", [road])], max_side=60)
     >>> frame.image.shape, frame.boxes.tolist()
@@ -215,11 +215,11 @@ def load_training_frames(
         for part in source.sets:
             for key, image in part:
                 labels = part.labels.frame(key)
-                _check_inside(labels.boxes[~labels.ignore], image.shape, f"{part.name}, frame {key!r}")
+                _check_inside(labels.boxes[~labels["ignore"]], image.shape, f"{part.name}, frame {key!r}")
                 reduced, scale = _reduce(image, max_side)
                 boxes = labels.boxes * scale
                 loaded.append(
-                    TrainingFrame(reduced, boxes[~labels.ignore], boxes[labels.ignore], source.name)
+                    TrainingFrame(reduced, boxes[~labels["ignore"]], boxes[labels["ignore"]], source.name)
                 )
     return loaded
 

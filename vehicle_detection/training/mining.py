@@ -16,15 +16,16 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.boxes import intersection_matrix, non_max_suppression
 from vehicle_detection.datasets import PatchSet
-from vehicle_detection.evaluation import FrameBoxes, Frames, LabelledFrames, keyed_frames
+from vehicle_detection.evaluation import Frames, LabelledFrames, keyed_frames
 from vehicle_detection.features import PATCH_SIZE
 from vehicle_detection.search import SearchParams
 from vehicle_detection.svm import CLASSIFIER_REMEDY, VehicleClassifier
+from vehicle_detection.tables import TrackTable
 
 
 def mine_negatives(
     frames: Frames,
-    labels: FrameBoxes,
+    labels: TrackTable,
     classifier: VehicleClassifier,
     *,
     search_params: SearchParams | None = None,
@@ -64,7 +65,7 @@ def mine_negatives(
     --------
     >>> from vehicle_detection import load_classifier
     >>> road = np.full((360, 640, 3), 90, np.uint8)
-    >>> len(mine_negatives([road], FrameBoxes([], None, [], frame_keys=[0]), load_classifier()))
+    >>> len(mine_negatives([road], TrackTable(frame_keys=[0]), load_classifier()))
     0
     """
     labelled = LabelledFrames(source, keyed_frames(frames), labels)

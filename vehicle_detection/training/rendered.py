@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer
-from vehicle_detection.evaluation import FrameBoxes, FrameKey, LabelledFrames
+from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.scenes import (
     Drive,
     Scene,
@@ -19,6 +19,7 @@ from vehicle_detection.scenes import (
     render_drive,
     render_scene,
 )
+from vehicle_detection.tables import FrameKey, TrackTable
 from vehicle_detection.training.frames import FrameDataset
 
 Rng = np.random.Generator
@@ -93,7 +94,7 @@ def rendered_source(*, frames: int = 300, random_state: int = 0) -> FrameDataset
     scenes = dict(enumerate(itertools.islice(_scenes(seed), count)))
     images: dict[FrameKey, NDArray[np.uint8]] = {key: scene.image for key, scene in scenes.items()}
     rows = [(key, scene, row) for key, scene in scenes.items() for row in scene.truth]
-    labels = FrameBoxes(
+    labels = TrackTable(
         [key for key, _, _ in rows],
         np.array([row.track for _, _, row in rows], np.intp),
         np.array([row.box for _, _, row in rows], np.float64).reshape(-1, 4),

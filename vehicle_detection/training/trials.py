@@ -26,7 +26,6 @@ from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import (
-    FrameBoxes,
     LabelledFrames,
     best_f1,
     evaluate_detections,
@@ -36,6 +35,7 @@ from vehicle_detection.features import FeatureParams
 from vehicle_detection.regions import RegionParams
 from vehicle_detection.search import SearchParams
 from vehicle_detection.svm import VehicleClassifier
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.training.classifier import TrainingOptions, check_labels, fit_features
 from vehicle_detection.training.feature_cache import FeatureCache, digest_of
 from vehicle_detection.training.results import RowStore, make_table, number_or_text
@@ -337,7 +337,7 @@ class TrialEvaluator:
         """Values of `_FRAME_METRICS` on a set of frames."""
         parts = {name: getattr(self.options, name) for name in ("search_params", "region_params")}
         with VehicleDetector(classifier, **parts, horizon=frames.horizon) as detector:
-            found = FrameBoxes.from_detections({key: detector.detect(image) for key, image in frames})
+            found = TrackTable.from_detections({key: detector.detect(image) for key, image in frames})
         scores = evaluate_detections(found, frames.labels, frames=frames.keys)
         best, _ = best_f1(*precision_recall_curve(found, frames.labels))
         return scores.f1, best, scores.average_precision, scores.mean_iou
@@ -412,8 +412,8 @@ class TrialRunner:
 def _digest_frames(frames: LabelledFrames) -> str:
     """Hash of a set's name, frame keys and labels; hashing the images would take too long."""
     labels = frames.labels
-    keys = [list(map(str, frames.keys)), list(map(str, labels.frames)), frames.horizon]
-    return digest_of(frames.name, keys, labels.boxes, labels.ignore, labels.tracks)
+    keys = [list(map(str, frames.keys)), list(map(str, labels["frame"])), frames.horizon]
+    return digest_of(frames.name, keys, labels.boxes, labels["ignore"], labels["track_id"])
 
 
 def _check_memory(length: int, n_patches: int, n_rows: int, n_copies: int) -> None:

@@ -19,8 +19,6 @@ from vehicle_detection._common import Floats, atomic_write, check_number, resolv
 from vehicle_detection.boxes import Platt
 from vehicle_detection.evaluation import (
     DetectionMatches,
-    FrameBoxes,
-    FrameKey,
     LabelledFrames,
     best_f1,
     calibrate_scores,
@@ -29,6 +27,7 @@ from vehicle_detection.evaluation import (
     match_detections,
     precision_recall_curve,
 )
+from vehicle_detection.tables import FrameKey, TrackTable
 from vehicle_detection.training.frames import FrameDataset
 
 if TYPE_CHECKING:
@@ -111,18 +110,17 @@ class FoldDetections:
 
     source: str
     frames: LabelledFrames
-    predictions: FrameBoxes  # scores are log-odds
+    predictions: TrackTable  # scores are log-odds
 
     @property
-    def labels(self) -> FrameBoxes:
+    def labels(self) -> TrackTable:
         """Labels that list all frames, also those without a box."""
-        return replace(self.frames.labels, frame_keys=tuple(self.frames.keys))
+        return self.frames.labels
 
     @property
     def logits(self) -> Floats:
         """Log-odds of each prediction."""
-        assert self.predictions.scores is not None
-        return self.predictions.scores
+        return self.predictions["score"]
 
     @cached_property
     def matches(self) -> DetectionMatches:
@@ -135,7 +133,7 @@ class FoldDetections:
         scored = ~self.matches.ignored
         return self.logits[scored], self.matches.match[scored] >= 0
 
-    def above(self, threshold: float) -> FrameBoxes:
+    def above(self, threshold: float) -> TrackTable:
         """Predictions with log-odds of at least `threshold`."""
         return self.predictions[self.logits >= threshold]
 
@@ -149,11 +147,11 @@ class FoldDetections:
         """Rows of the scored labels that are occluded, truncated and narrow, see `FoldScore`."""
         labels, rows = self.labels, self.matches.usable
         boxes = labels.boxes[rows]
-        sizes = np.array([self.shapes[labels.frames[row]] for row in rows.tolist()]).reshape(-1, 2)
+        sizes = np.array([self.shapes[labels["frame"][row]] for row in rows.tolist()]).reshape(-1, 2)
         at_edge = (boxes[:, 0] <= _EDGE) | (boxes[:, 2:] >= sizes[:, ::-1] - _EDGE).any(axis=1)
         return {
-            "occluded": rows[labels.occluded[rows] == 1],
-            "truncated": rows[at_edge | (labels.truncated[rows] > 0)],
+            "occluded": rows[labels["occluded"][rows] == 1],
+            "truncated": rows[at_edge | (labels["truncated"][rows] > 0)],
             "narrow": rows[boxes[:, 2] - boxes[:, 0] < _NARROW],
         }
 
@@ -161,10 +159,7 @@ class FoldDetections:
         """Return the same detections in some of the frames, which are read into memory."""
         images = {key: image for key, image in self.frames if key in keys}
         frames = LabelledFrames(name or self.frames.name, images, self.frames.labels)
-        kept = [row for row, key in enumerate(self.predictions.frames) if key in images]
-        return replace(
-            self, frames=frames, predictions=replace(self.predictions[kept], frame_keys=tuple(images))
-        )
+        return replace(self, frames=frames, predictions=self.predictions.select(images))
 
 
 def detect_in_source(
@@ -194,7 +189,7 @@ def detect_in_source(
         def detect(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Any]:
             return pair[0], search.find(pair[1], None, min_vehicle_score=lowest).vehicles
 
-        found = [FrameBoxes.from_detections(dict(pool.map(detect, part))) for part in source.sets]
+        found = [TrackTable.from_detections(dict(pool.map(detect, part))) for part in source.sets]
     return [FoldDetections(source.name, part, boxes) for part, boxes in zip(source.sets, found)]
 
 
@@ -223,7 +218,7 @@ def score_fold(
         name=fold.frames.name,
         source=fold.source,
         frames=len(fold.frames),
-        vehicles=int((~labels.ignore).sum()),
+        vehicles=int((~labels["ignore"]).sum()),
         **at_threshold,
         false_per_frame=scores.false_positives_per_frame,
         **_false_without_vehicles(fold, above),
@@ -246,8 +241,8 @@ def _mean(values: NDArray[Any]) -> float:
 def _false_without_vehicles(fold: FoldDetections, above: NDArray[np.bool_]) -> dict[str, Any]:
     """Count the false boxes `above` the threshold, per frame without a label and without a scored one."""
     labels, false = fold.labels, above & (fold.matches.match < 0) & ~fold.matches.ignored
-    counts = Counter(fold.predictions.frames[row] for row in np.flatnonzero(false).tolist())
-    scored = {labels.frames[row] for row in fold.matches.usable.tolist()}
+    counts = Counter(fold.predictions["frame"][row] for row in np.flatnonzero(false).tolist())
+    scored = {labels["frame"][row] for row in fold.matches.usable.tolist()}
     return {
         "false_per_empty_frame": _mean(
             np.array([counts[key] for key in fold.frames.keys if not len(labels.rows(key))])

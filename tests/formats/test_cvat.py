@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.video.clips import write_clip
-from vehicle_detection import Detections, read_labels, write_boxes, write_tracks
+from vehicle_detection import Detections, TrackTable, read_labels, write_tracks
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "cvat.md"
 BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
@@ -32,23 +32,23 @@ def test_videos(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write_clip(tmp_path / "drive.mp4", [np.zeros((96, 128, 3), np.uint8)] * 4)
     places = {1: (10.25, 20, 50, 60), 2: (70, 20, 110, 50)}
-    rows = [(frame, track, *box, 1.5) for frame in range(3) for track, box in places.items()]
-    write_tracks(rows, "tracks.csv")
+    boxes = [*places.values()] * 3
+    write_tracks(TrackTable([0, 0, 1, 1, 2, 2], [*places] * 3, boxes, score=[1.5] * 6), "tracks.csv")
     names = {}
     exec(BLOCKS[0], names)
     correct(tmp_path / "annotations.zip", tmp_path / "corrected.zip")
     exec(BLOCKS[1], names)
     labels = read_labels("labels.csv")
-    assert labels.tracks.tolist() == [1, 1, 1]
+    assert labels["track_id"].tolist() == [1, 1, 1]
     np.testing.assert_allclose(labels.boxes[:, 0], [15.25, 10.25, 10.25])
-    assert labels.ignore.tolist() == [False, True, False]
+    assert labels["ignore"].tolist() == [False, True, False]
     assert "2 found, 0 missed, 3 false, 1 ignored" in capsys.readouterr().out
 
 
 def test_images(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     boxes = Detections([[10, 20, 50, 60], [70, 20, 90, 40]], [1.5, 0.5])
-    write_boxes([("a.jpg", boxes), ("b.jpg", Detections.empty())], "boxes.json")
+    write_tracks(TrackTable.from_detections({"a.jpg": boxes, "b.jpg": Detections.empty()}), "boxes.json")
     document = json.loads(Path("boxes.json").read_text())
     # CVAT numbers images and annotations by itself; the second box was deleted there.
     ids = {image["id"]: number for number, image in enumerate(document["images"], start=1)}

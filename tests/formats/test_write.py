@@ -11,13 +11,9 @@ from pycocotools.cocoeval import COCOeval
 
 from tests.evaluation.cases import CAR, boxes_of, moved
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.evaluation import (
-    FrameBoxes,
-    evaluate_detections,
-    precision_recall_curve,
-    read_labels,
-    write_labels,
-)
+from vehicle_detection.evaluation import evaluate_detections, precision_recall_curve
+from vehicle_detection.formats import read_labels, write_labels
+from vehicle_detection.tables import TrackTable
 
 corner = st.floats(-1e4, 1e4)
 side = st.floats(0.01, 1e4)  # a label has an area
@@ -46,14 +42,14 @@ def frame_boxes(draw, *kinds, scored=None):
         filled = np.array(column(values), np.float64)
         return None if np.isnan(filled).all() else filled
 
-    return FrameBoxes(
+    return TrackTable(
         frames,
         [row if has_track else -1 for row, has_track in enumerate(column(st.booleans()))],
         [(x, y, x + width, y + height) for x, y, width, height in first],
         occluded=column(st.integers(0, 2)),
         truncated=column(st.floats(0, 1)),
         ignore=np.array(column(st.booleans()), bool),
-        scores=column(st.floats(-50, 50)) if predicted else None,
+        score=column(st.floats(-50, 50)) if predicted else None,
         distance_m=optional(unknown),
         speed_mps=optional(unknown),
         frame_keys=draw(st.lists(kind, max_size=3)),
@@ -61,20 +57,14 @@ def frame_boxes(draw, *kinds, scored=None):
 
 
 def assert_equal(read, wanted, columns, *, tolerance=0.0):
-    """Compare boxes and the named columns of two sides, row by row."""
-    assert read.frames == wanted.frames
+    """Compare boxes and the named columns of two tables, row by row."""
+    assert read["frame"].tolist() == wanted["frame"].tolist()
     np.testing.assert_allclose(read.boxes, wanted.boxes, rtol=0, atol=tolerance)
-    for name in columns if len(wanted) else ():
-        ours, theirs = getattr(read, name), getattr(wanted, name)
-        if theirs is not None and np.isnan(theirs).all():
-            theirs = None
-        if ours is None or theirs is None:
-            assert ours is theirs, name
-        else:
-            np.testing.assert_array_equal(ours, theirs, err_msg=name)
+    for name in columns:
+        np.testing.assert_array_equal(read[name], wanted[name], err_msg=name)
 
 
-SCORED = ("tracks", "ignore", "scores")
+SCORED = ("track_id", "ignore", "score")
 RANGES = ("distance_m", "speed_mps")
 ALL = (*SCORED, "occluded", "truncated", *RANGES)
 
@@ -90,7 +80,7 @@ def test_tables_hold_every_column(tmp_path_factory, boxes):
 @given(frame_boxes(numbers))
 def test_mot_files_hold_tracks_flags_and_scores(tmp_path_factory, boxes):
     path = tmp_path_factory.mktemp("mot") / "t.txt"
-    boxes = boxes if boxes.scores is None else boxes[~boxes.ignore]
+    boxes = boxes if "score" not in boxes.columns else boxes[~boxes["ignore"]]
     write_labels(boxes, path)
     # The file has left, top, width and height with nine decimals.
     assert_equal(read_labels(path, format="mot"), boxes, SCORED, tolerance=1e-8)
@@ -109,7 +99,7 @@ def test_coco_data_sets_hold_all_frames(tmp_path_factory, boxes):
 @given(frame_boxes(numbers, names, scored=True))
 def test_coco_results_are_read_with_their_truth(tmp_path_factory, boxes):
     folder = tmp_path_factory.mktemp("results")
-    boxes = boxes[~boxes.ignore]
+    boxes = boxes[~boxes["ignore"]]
     write_labels(boxes[:0], folder / "truth.json")
     found = {"path": folder / "found.json", "truth": folder / "truth.json"}
     write_labels(boxes, format="coco_results", **found)
@@ -124,14 +114,14 @@ def test_archives_for_cvat_hold_tracks_and_flags(tmp_path_factory, boxes):
     path = tmp_path_factory.mktemp("cvat") / "t.zip"
     write_labels(boxes, path)
     read = read_labels(path)
-    assert read.scores is None
-    assert_equal(read, boxes, ("tracks", "ignore"), tolerance=1e-8)
+    assert "score" not in read.columns
+    assert_equal(read, boxes, ("track_id", "ignore"), tolerance=1e-8)
 
 
 @given(frame_boxes(st.integers(0, 999_999)))
 def test_yolo_folders_hold_frames_and_confidences(tmp_path_factory, boxes):
     path = tmp_path_factory.mktemp("yolo") / "t"
-    boxes = boxes[~boxes.ignore]
+    boxes = boxes[~boxes["ignore"]]
     # Inside the frame, and larger than the six decimals resolve.
     boxes.boxes[:, :2] = np.abs(boxes.boxes[:, :2])
     boxes.boxes[:, 2:] = np.add(boxes.boxes[:, :2], (1.0, 9.5))
@@ -143,9 +133,11 @@ def test_yolo_folders_hold_frames_and_confidences(tmp_path_factory, boxes):
     assert read.frame_keys == tuple(sorted(boxes.frame_keys))
     boxes = boxes[[row for key in read.frame_keys for row in boxes.rows(key)]]
     np.testing.assert_allclose(read.boxes, boxes.boxes, atol=0.1)
-    if boxes.scores is not None and len(boxes):
-        assert read.tracks.tolist() == boxes.tracks.tolist()
-        np.testing.assert_allclose(1 / (1 + np.exp(-read.scores)), 1 / (1 + np.exp(-boxes.scores)), atol=2e-6)
+    if "score" in boxes.columns and len(boxes):
+        assert read["track_id"].tolist() == boxes["track_id"].tolist()
+        np.testing.assert_allclose(
+            1 / (1 + np.exp(-read["score"])), 1 / (1 + np.exp(-boxes["score"])), atol=2e-6
+        )
 
 
 @given(frame_boxes(file_names))
@@ -161,12 +153,12 @@ def test_kitti_folders_hold_frames_and_what_is_visible(tmp_path_factory, boxes):
     # Each frame is a file, so that the rows are sorted by frame.
     order = [row for key in boxes.frame_keys for row in boxes.rows(key)]
     boxes = boxes[order]
-    assert_equal(read, boxes, ("scores",))
-    cars = ~boxes.ignore
-    np.testing.assert_array_equal(read.occluded[cars], boxes.occluded[cars])
-    np.testing.assert_array_equal(read.truncated[cars], boxes.truncated[cars])
-    assert (read.tracks[~cars] == -1).all()
-    assert read.ignore[~cars].all()
+    assert_equal(read, boxes, ("score",))
+    cars = ~boxes["ignore"]
+    np.testing.assert_array_equal(read["occluded"][cars], boxes["occluded"][cars])
+    np.testing.assert_array_equal(read["truncated"][cars], boxes["truncated"][cars])
+    assert (read["track_id"][~cars] == -1).all()
+    assert read["ignore"][~cars].all()
 
 
 # --- motmetrics ---
@@ -177,20 +169,22 @@ def test_kitti_folders_hold_frames_and_what_is_visible(tmp_path_factory, boxes):
 def test_motmetrics_reads_the_same_boxes_and_frames(tmp_path, predicted):
     rng = np.random.default_rng(0)
     corners = rng.uniform(0, 600, (40, 2))
-    boxes = FrameBoxes(
+    boxes = TrackTable(
         np.repeat(np.arange(20) * 3, 2),
         np.tile([1, 2], 20),
         np.hstack([corners, corners + rng.uniform(20, 90, (40, 2))]),
-        scores=rng.normal(size=40) if predicted else None,
+        score=rng.normal(size=40) if predicted else None,
         ignore=None if predicted else rng.random(40) < 0.3,
     )
     write_labels(boxes, tmp_path / "t.txt")
     least = -math.inf if predicted else 1  # motmetrics drops labels with the flag 0 so
     table = motmetrics.io.loadtxt(str(tmp_path / "t.txt"), fmt="mot15-2D", min_confidence=least)
     read = read_labels(tmp_path / "t.txt")
-    for side in (boxes[~boxes.ignore], read[~read.ignore]):
-        assert [frame - 1 for frame, _ in table.index] == list(side.frames)  # motmetrics counts frames from 1
-        assert [track for _, track in table.index] == side.tracks.tolist()
+    for side in (boxes[~boxes["ignore"]], read[~read["ignore"]]):
+        assert [frame - 1 for frame, _ in table.index] == side[
+            "frame"
+        ].tolist()  # motmetrics counts frames from 1
+        assert [track for _, track in table.index] == side["track_id"].tolist()
         sizes = side.boxes[:, 2:] - side.boxes[:, :2]
         theirs = table[["X", "Y", "Width", "Height"]].to_numpy()
         np.testing.assert_allclose(theirs, np.hstack([side.boxes[:, :2], sizes]), rtol=0, atol=1e-8)
@@ -228,7 +222,7 @@ def detection_trial(seed, names_=False):
         ignore=ignore,
         frame_keys=range(30),
     )
-    result = boxes_of(*found, scores=rng.permutation(len(found)) / 7)
+    result = boxes_of(*found, score=rng.permutation(len(found)) / 7)
     # Prefixes that change the order of the frames, too.
     rename = (lambda key: f"{'zax'[key % 3]}{key}.png") if names_ else (lambda key: key)
     return result.renamed(rename), truth.renamed(rename)
@@ -304,7 +298,7 @@ def test_results_take_the_ids_of_a_foreign_ground_truth(tmp_path):
 @pytest.mark.parametrize(
     ("boxes", "name", "options", "message"),
     [
-        ([], "t.csv", {}, "labels must be a FrameBoxes, got"),
+        ([], "t.csv", {}, "labels must be a TrackTable, got"),
         (boxes_of((0, 1, CAR)), "t.xlsx", {}, "path must end in .csv, .jsonl, .*or set the format to 'csv'"),
         (boxes_of((0, 1, CAR)), "t.csv", {"format": "voc"}, "format must be one of 'csv', .* 'kitti'"),
         (boxes_of((0, 1, CAR)), "missing/t.csv", {}, "path needs an existing folder"),

@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, evaluate_detections, evaluate_tracks, read_labels
+from vehicle_detection.evaluation import evaluate_detections, evaluate_tracks
+from vehicle_detection.formats import read_labels
 from vehicle_detection.images import write_image
+from vehicle_detection.tables import TrackTable
 
 HEADER = "frame,track,x1,y1,x2,y2,occluded,truncated,ignore"
 
@@ -27,13 +29,13 @@ def written(folder, text, name="labels.csv"):
 
 def test_csv_of_labels(tmp_path):
     labels = read_labels(written(tmp_path, CSV))
-    assert labels.frames == (0, 0, 2)
-    assert labels.tracks.tolist() == [-1, -1, 1]
+    assert labels["frame"].tolist() == [0, 0, 2]
+    assert labels["track_id"].tolist() == [-1, -1, 1]
     assert labels.boxes[0].tolist() == [0, 370, 601.5, 476]
-    assert labels.occluded.tolist() == [0, 0, 1]
-    assert labels.truncated.tolist() == [0, 0, 0.25]
-    assert labels.ignore.tolist() == [True, True, False]
-    assert labels.scores is labels.distance_m is labels.speed_mps is None
+    assert labels["occluded"].tolist() == [0, 0, 1]
+    assert labels["truncated"].tolist() == [0, 0, 0.25]
+    assert labels["ignore"].tolist() == [True, True, False]
+    assert labels.columns == ("frame", "track_id", "x1", "y1", "x2", "y2", "occluded", "truncated", "ignore")
 
 
 @pytest.mark.parametrize(
@@ -54,37 +56,37 @@ def test_csv_of_labels(tmp_path):
 @pytest.mark.parametrize("name", ["labels.csv", "labels.txt"])
 def test_csv_dialects_give_equal_labels(tmp_path, text, name):
     plain, other = read_labels(written(tmp_path, CSV)), read_labels(written(tmp_path, text, name))
-    assert other.frames == plain.frames
-    for column in ("boxes", "tracks", "occluded", "truncated", "ignore"):
-        np.testing.assert_array_equal(getattr(other, column), getattr(plain, column))
+    assert other["frame"].tolist() == plain["frame"].tolist()
+    for column in ("x1", "y2", "track_id", "occluded", "truncated", "ignore"):
+        np.testing.assert_array_equal(other[column], plain[column])
 
 
 def test_csv_of_predictions(tmp_path):
     header = "frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps\n"
     text = header + "a.jpg,,1,2,3,4,0.5,,\nb.jpg,7,1,2,3,2,-1,30.5,\n"
     found = read_labels(written(tmp_path, text))
-    assert found.frames == ("a.jpg", "b.jpg")
-    assert found.tracks.tolist() == [-1, 7]
-    assert found.scores.tolist() == [0.5, -1]
-    np.testing.assert_array_equal(found.distance_m, [np.nan, 30.5])
-    assert found.speed_mps is None
+    assert found["frame"].tolist() == ["a.jpg", "b.jpg"]
+    assert found["track_id"].tolist() == [-1, 7]
+    assert found["score"].tolist() == [0.5, -1]
+    np.testing.assert_array_equal(found["distance_m"], [np.nan, 30.5])
+    assert np.isnan(found["speed_mps"]).all()
     assert len(read_labels(written(tmp_path, header))) == 0
 
 
 @pytest.mark.parametrize("name", ["track", "track_id"])
 def test_csv_labels_need_only_frames_tracks_and_boxes(tmp_path, name):
     labels = read_labels(written(tmp_path, f"frame,{name},x1,y1,x2,y2\n0,1,0,0,9,9\n1,1,1,0,9,9\n"))
-    assert labels.tracks.tolist() == [1, 1]
-    assert labels.scores is None
-    assert not labels.ignore.any()
-    assert not labels.occluded.any()
+    assert labels["track_id"].tolist() == [1, 1]
+    assert "score" not in labels.columns
+    assert not labels["ignore"].any()
+    assert not labels["occluded"].any()
     ignored = read_labels(written(tmp_path, f"frame,{name},x1,y1,x2,y2,ignore\n0,1,0,0,9,9,1\n"))
-    assert ignored.ignore.tolist() == [True]
+    assert ignored["ignore"].tolist() == [True]
 
 
 def test_csv_frames_with_leading_zeros_are_names(tmp_path):
     text = f"{HEADER}\n007,1,0,0,9,9,0,0,0\n"
-    assert read_labels(written(tmp_path, text)).frames == ("007",)
+    assert read_labels(written(tmp_path, text))["frame"].tolist() == ["007"]
 
 
 @pytest.mark.parametrize(
@@ -96,8 +98,6 @@ def test_csv_frames_with_leading_zeros_are_names(tmp_path):
             "lacks the columns track; found frame, x1, .*labels have frame,track,x1,y1,x2,y2 and, "
             "optionally, occluded,truncated,ignore; predictions frame,track_id",
         ),
-        (f"{HEADER}\n0,1,0,0,9,9,,0,0\n", "line 2: occluded must be a finite number, got ''"),
-        (f"{HEADER}\n0,1,0,0,9,9,0,0,\n", "line 2: ignore must be 0 or 1, got ''"),
         ("frame,score,x1,y1,x2,y2\n", "lacks the columns track_id; found"),
         ("0,1,2,3,4,5,0,0,0\n", "lacks the columns frame.* found 0, 1, 2"),
         (HEADER + ",x1\n", "has the column x1 more than once"),
@@ -118,11 +118,14 @@ def test_csv_frames_with_leading_zeros_are_names(tmp_path):
             id="long",
         ),
         (f"{HEADER}\n0,1.5,0,0,9,9,0,0,0\n", "line 2: track must be a whole number, got '1.5'"),
-        (f"{HEADER}\n0,-2,0,0,9,9,0,0,0\n", "line 2: track must be at least -1"),
-        (f"{HEADER}\n0,1e99,0,0,9,9,0,0,0\n", "line 2: track must be at most"),
-        (f"{HEADER}\n-1,1,0,0,9,9,0,0,0\n", "line 2: frame must be at least 0"),
+        (
+            f"{HEADER}\n0,-2,0,0,9,9,0,0,0\n",
+            "line 2: track must be a number from 0, or -1 for none",
+        ),
+        (f"{HEADER}\n0,1e99,0,0,9,9,0,0,0\n", "line 2: track must be a number"),
+        (f"{HEADER}\n-1,1,0,0,9,9,0,0,0\n", "line 2: frame must be a whole number from 0 or a name, got -1"),
         (f"{HEADER}\n,1,0,0,9,9,0,0,0\n", "line 2: frame is empty"),
-        (f"{HEADER}\n0,1,0,0,9,9,0,1.5,0\n", "line 2: truncated must be at most 1"),
+        (f"{HEADER}\n0,1,0,0,9,9,0,1.5,0\n", "line 2: truncated must be a fraction from 0 to 1, got '1.5'"),
         (
             f"{HEADER}\n0,1,0,0,9,9,0,0,0\n".replace(",", ";").replace(";9;9;", ";9,5;9;"),
             "use a decimal point",
@@ -164,27 +167,27 @@ def test_kitti_folder(tmp_path):
     labels = read_labels(tmp_path)
     assert labels.frame_keys == ("000002", "000010")
     assert labels.boxes[0].tolist() == [599.41, 156.40, 649.25, 189.25]
-    assert labels.ignore.tolist() == [False, True, True, True, True, True]
+    assert labels["ignore"].tolist() == [False, True, True, True, True, True]
     # KITTI has no tracks, but an ignored vehicle without one would be a region.
-    assert labels.tracks.tolist() == [-1, 1, 2, 3, 4, -1]
+    assert labels["track_id"].tolist() == [-1, 1, 2, 3, 4, -1]
     assert len(read_labels(tmp_path / "000002.txt")) == 6
-    assert (~read_labels(tmp_path, classes=["Tram"]).ignore).sum() == 1
+    assert (~read_labels(tmp_path, classes=["Tram"])["ignore"]).sum() == 1
     scored = written(tmp_path, "Car -1 -1 0 200 10 220 20 1 1 1 1 1 1 1 0.5\n", "000002.txt")
     result = read_labels(scored)
-    assert (result.scores.tolist(), result.ignore.tolist()) == ([0.5], [False])
+    assert (result["score"].tolist(), result["ignore"].tolist()) == ([0.5], [False])
 
 
 def test_mot_file(tmp_path):
     truth = read_labels(written(tmp_path, "1,3,10,20,30,40,1,1,1\n2,3,11,20,30,40,0,1,0.5\n", "gt.txt"))
-    assert truth.frames == (0, 1)
+    assert truth["frame"].tolist() == [0, 1]
     assert truth.boxes[0].tolist() == [9, 19, 39, 59]  # MOTChallenge counts pixels from 1
-    assert truth.ignore.tolist() == [False, True]
-    assert truth.scores is None
+    assert truth["ignore"].tolist() == [False, True]
+    assert "score" not in truth.columns
     found = read_labels(written(tmp_path, "1, 3, 10, 20, 30, 40, 0.75, -1, -1, -1,\r\n", "mot.txt"))
-    assert found.scores.tolist() == [0.75]
-    assert read_labels(written(tmp_path, "1 -1 10 20 30 40\n", "bare.txt")).tracks.tolist() == [-1]
+    assert found["score"].tolist() == [0.75]
+    assert read_labels(written(tmp_path, "1 -1 10 20 30 40\n", "bare.txt"))["track_id"].tolist() == [-1]
     by_class = written(tmp_path, "1,1,0,0,9,9,1,1,1\n1,2,0,0,9,9,1,3,1\n", "gt.txt")
-    assert read_labels(by_class, classes={3}).tracks.tolist() == [2]
+    assert read_labels(by_class, classes={3})["track_id"].tolist() == [2]
 
 
 def coco(**changes):
@@ -205,12 +208,16 @@ def test_coco_file(tmp_path):
     labels = read_labels(written(tmp_path, coco(), "instances.json"))
     assert labels.frame_keys == ("a.jpg", "b.jpg")
     assert labels.boxes.tolist() == [[10, 20, 40, 60], [0, 0, 60, 40], [90, 0, 189, 40]]
-    assert labels.ignore.tolist() == [False, True, True]
-    assert labels.tracks.tolist() == [-1, 2, -1]
+    assert labels["ignore"].tolist() == [False, True, True]
+    assert labels["track_id"].tolist() == [-1, 2, -1]
     assert len(read_labels(written(tmp_path, coco(), "coco.txt"), classes=["person"])) == 2
     entry = {"image_id": 5, "category_id": 1, "bbox": [1, 2, 3, 4], "track_id": 9, "score": 0.5}
     found = read_labels(written(tmp_path, coco(annotations=[entry], images=[{"id": 5}]), "a.json"))
-    assert (found.frames, found.tracks.tolist(), found.scores.tolist()) == ((5,), [9], [0.5])
+    assert (tuple(found["frame"].tolist()), found["track_id"].tolist(), found["score"].tolist()) == (
+        (5,),
+        [9],
+        [0.5],
+    )
 
 
 @pytest.mark.parametrize(
@@ -248,7 +255,7 @@ def test_coco_file(tmp_path):
         ("a.txt", "0,1,2,3,4,5\n", r"line 1: frame \(counted from 1\) must be at least 1"),
         ("a.txt", "1,1,2,3\n", "line 1: expected frame, id, x, y, width, height, found 4"),
         ("a.txt", "1,1,2,3,-4,5\n", "line 1: a box needs x1 < x2"),
-        ("a.txt", "1,1,1e308,3,1.7e308,5\n", "line 1: a box needs finite corners"),
+        ("a.txt", "1,1,1e308,3,1.7e308,5\n", "line 1: x2 must be a finite number"),
         ("a.txt", "1,1,2,3,4,5,0.5\n1,2,2,3,4,5\n", "line 2: some boxes have a score and some have none"),
     ],
 )
@@ -291,7 +298,7 @@ def test_readers_raise_only_dataset_errors(tmp_path_factory, kind, lines, headed
     )
     path = written(tmp_path_factory.mktemp("fuzz"), text)
     try:
-        assert isinstance(read_labels(path, format=kind), FrameBoxes)
+        assert isinstance(read_labels(path, format=kind), TrackTable)
     except DatasetError as error:
         assert len(str(error).splitlines()) == 1  # noqa: PT017
 
@@ -317,7 +324,7 @@ JSON = st.recursive(
 def test_coco_reader_raises_only_dataset_errors(tmp_path_factory, changes):
     path = written(tmp_path_factory.mktemp("fuzz"), coco(**changes), "a.json")
     with contextlib.suppress(DatasetError):
-        assert isinstance(read_labels(path), FrameBoxes)
+        assert isinstance(read_labels(path), TrackTable)
 
 
 @pytest.mark.realdata
@@ -336,7 +343,7 @@ def test_real_labels(real_data: Path, name, frames, usable, shape):
     path = real_data / "labels" / f"{name}.csv"
     labels = read_labels(path, shape=shape)
     assert len(labels.frame_keys) == frames
-    assert (~labels.ignore).sum() == usable
+    assert (~labels["ignore"]).sum() == usable
     scores = evaluate_detections(labels, labels)
     assert (scores.f1, scores.mean_iou, scores.tp) == (1, 1, usable)
     if shape is not None:
@@ -361,10 +368,10 @@ def write_zip(path, text, names=None):
 def test_an_archive_of_cvat(tmp_path):
     text = "1,3,10,20,30,40,1,2,1.0\n2,4,10,20,30,40,0,2,0.5\n2,5,1,1,2,2,1,1,1.0\n"
     found = read_labels(write_zip(tmp_path / "t.zip", text, "person\nCar\n"))
-    assert found.frames == (0, 1)
-    assert found.tracks.tolist() == [3, 4]
+    assert found["frame"].tolist() == [0, 1]
+    assert found["track_id"].tolist() == [3, 4]
     assert found.boxes.tolist() == [[10, 20, 40, 60]] * 2
-    assert found.ignore.tolist() == [False, True]
+    assert found["ignore"].tolist() == [False, True]
     assert len(read_labels(tmp_path / "t.zip", classes=["Person"])) == 1
     assert len(read_labels(write_zip(tmp_path / "u.zip", text))) == 3
 
@@ -409,7 +416,7 @@ def test_a_yolo_folder(tmp_path, name, text):
     found = read_labels(tmp_path, shape=(100, 200))
     assert found.frame_keys == ("a", "b")
     np.testing.assert_allclose(found.boxes, [[80, 30, 120, 70]])
-    assert found.scores is None
+    assert "score" not in found.columns
     assert len(read_labels(tmp_path, shape=(100, 200), classes=["person", "car"])) == 2
 
 
@@ -426,7 +433,7 @@ def test_a_yolo_folder_of_images_of_several_sizes(tmp_path):
     rotated.save(images / "c.jpg", exif=exif)
     written(labels, "0 0.5 0.5 1.001 1\n", "c.txt")
     found = read_labels(labels, images=images)
-    assert found.frames == ("000001.png", "000002.jpg", "c.jpg")
+    assert found["frame"].tolist() == ["000001.png", "000002.jpg", "c.jpg"]
     np.testing.assert_allclose(found.boxes, [[32, 12, 48, 28], [80, 30, 120, 70], [0, 0, 30, 60]])
     with pytest.raises(DatasetError, match=r"labels holds no \.txt file; .* name .*labels.train"):
         read_labels(tmp_path, images=images)
@@ -477,7 +484,7 @@ def test_files_without_a_class_of_vehicles_are_refused(tmp_path):
     [
         ("1 0.5 0.5", r"a\.txt line 1: expected class, center and size, .*, found 3 values"),
         ("1 0.5 0.5 x 0.1", "side of the box must be a finite number, got 'x'"),
-        ("1 0.5 0.5 0.1 0.1 1.5", "confidence must be at most 1"),
+        ("1 0.5 0.5 0.1 0.1 1.5", "confidence must be from 0 to 1"),
         ("1 90 40 9 9", "the box 90 40 9 9 lies outside the image; center and size are fractions"),
     ],
 )
@@ -497,7 +504,7 @@ def test_labels_without_tracks_have_no_track_scores(tmp_path):
     for frame in range(2):
         written(tmp_path, f"Car 0 0 0 {10 + frame} 10 90 70 1 1 1 1 1 1 1\n", f"{frame:06d}.txt")
     labels = read_labels(tmp_path)
-    found = FrameBoxes(labels.frames, [1, 1], labels.boxes)
+    found = TrackTable(labels["frame"], [1, 1], labels.boxes)
     with pytest.raises(InvalidInputError, match="labels must have a track for every box"):
         evaluate_tracks(found, labels)
 
@@ -506,7 +513,7 @@ def test_labels_without_tracks_have_no_track_scores(tmp_path):
 def test_a_table_with_tracks_and_scores_holds_predictions(tmp_path, track):
     text = f"frame,{track},x1,y1,x2,y2,score\n0,1,0,0,50,40,2.5\n0,2,200,0,250,40,0.1\n"
     found = read_labels(written(tmp_path, text))
-    assert (found.tracks.tolist(), found.scores.tolist()) == ([1, 2], [2.5, 0.1])
+    assert (found["track_id"].tolist(), found["score"].tolist()) == ([1, 2], [2.5, 0.1])
 
 
 def test_a_text_file_without_boxes_is_one_of_predictions(tmp_path):
@@ -561,8 +568,8 @@ def test_blank_lines_of_an_archive_of_cvat(tmp_path):
 def test_an_empty_column_of_scores_is_one_of_labels(tmp_path):
     text = "frame,track,x1,y1,x2,y2,score\n0,3,1,2,30,40,\n"
     labels = read_labels(written(tmp_path, text))
-    assert (labels.tracks.tolist(), labels.scores) == ([3], None)
-    with pytest.raises(DatasetError, match="score must be a finite number, got ''"):
+    assert (labels["track_id"].tolist(), "score" in labels.columns) == ([3], False)
+    with pytest.raises(DatasetError, match="line 2: some boxes have a score and some have none"):
         read_labels(written(tmp_path, f"{text}0,4,1,2,30,40,0.5\n"))
 
 
@@ -577,10 +584,10 @@ def test_classes_of_a_table(tmp_path, name):
         lines = [{"frame": f, "track": n, **box, "class": kind} for n, (f, kind) in enumerate(rows)]
         text = "\n".join(map(json.dumps, lines))
     labels = read_labels(written(tmp_path, text, name))
-    assert (labels.frames, labels.ignore.tolist()) == ((0, 1), [False, True])
+    assert (tuple(labels["frame"].tolist()), labels["ignore"].tolist()) == ((0, 1), [False, True])
     assert labels.frame_keys == (0, 1, 2)
     people = read_labels(tmp_path / name, classes=["person"])
-    assert (people.frames, people.ignore.tolist()) == ((0, 1, 2), [False, True, False])
+    assert (people["frame"].tolist(), people["ignore"].tolist()) == ([0, 1, 2], [False, True, False])
     with pytest.raises(DatasetError, match="has no class among boat; found 'car', 'person', 'tram'"):
         read_labels(tmp_path / name, classes=["boat"])
 

@@ -1,0 +1,236 @@
+"""COCO JSON: data sets of images and annotations, and lists of results."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from vehicle_detection._common import Limit, read_regular_file
+from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection.tables import (
+    CORNERS,
+    LOOKALIKE_CLASSES,
+    NO_TRACK,
+    TRACK_COLUMNS,
+    VEHICLE_CLASSES,
+    FrameKey,
+    TrackTable,
+    check_classes,
+    parse_number,
+)
+
+Record = dict[str, Any]
+"""Values of a row by the names of their columns, None where a value is unknown."""
+Write = Callable[[FrameKey, Sequence[Record]], None]
+"""Writes rows of a frame, of which there may be none."""
+
+_CATEGORIES = [{"id": 1, "name": "vehicle", "supercategory": "vehicle"}]
+
+
+def read_text(file: Path) -> str:
+    """Read a file of UTF-8 text of limited size."""
+    try:
+        return read_regular_file(file, str(file), Limit.TEXT_BYTES, error=DatasetError).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise DatasetError(f"{file} is not UTF-8 text; save it as UTF-8") from None
+
+
+def json_reason(error: ValueError | RecursionError) -> str:
+    """Say why a text cannot be parsed; Python refuses integers of thousands of digits."""
+    if isinstance(error, RecursionError):
+        return "nested too deeply"
+    return error.msg if isinstance(error, json.JSONDecodeError) else "a number has too many digits"
+
+
+class CocoFile(NamedTuple):
+    """A COCO data set, or a list of results, whose images and categories are those of another file."""
+
+    images: dict[Any, FrameKey]  # frame of each image id, in the order of the file
+    entries: list[dict[str, Any]]  # of the images
+    categories: dict[Any, str]  # lower-case name of each category id
+    annotations: list[Any]
+
+
+def _read_file(source: Path, truth: Path | None = None) -> CocoFile:
+    """Read a COCO file; `truth` names the data set that a list of results belongs to."""
+    try:
+        data = json.loads(read_text(source))
+    except (ValueError, RecursionError) as error:
+        line = f" line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
+        raise DatasetError(f"{source}{line}: not JSON text ({json_reason(error)})") from None
+    if isinstance(data, list) and all(isinstance(entry, dict) and "image_id" in entry for entry in data):
+        if truth is None:
+            raise DatasetError(
+                f"{source} is a list of COCO results, predictions of images that the ground truth lists; "
+                "read it with truth=, and use the ground truth, a COCO data set, as labels"
+            )
+        return _read_file(truth)._replace(annotations=data)
+    parts = data if isinstance(data, dict) else {}
+    needed = ("images", "annotations", "categories")
+    missing = [name for name in needed if not isinstance(parts.get(name), list)]
+    if missing:
+        raise DatasetError(f"{source} is not a COCO file: it lacks the lists {', '.join(missing)}")
+    try:
+        images = {image["id"]: _frame_of(image) for image in data["images"]}
+        names = {entry["id"]: str(entry["name"]).lower() for entry in data["categories"]}
+    except (KeyError, TypeError, AttributeError):
+        raise DatasetError(
+            f"{source}: every image and category needs an id, and every category a name"
+        ) from None
+    if {*map(type, images.values())} not in (set(), {int}, {str}):
+        raise DatasetError(f"{source}: give every image a file_name, or none of them and integer ids")
+    if len(set(images.values())) < len(data["images"]):
+        raise DatasetError(f"{source}: two images share an id or a file_name; make them unique")
+    return CocoFile(images, data["images"], names, data["annotations"])
+
+
+def _frame_of(image: dict[str, Any]) -> FrameKey:
+    """Frame of an image: its file name; the frame's number where `image_entry` put it into the name."""
+    name, frame = image.get("file_name", image["id"]), image.get("frame")
+    return frame if isinstance(frame, int) and name == f"{frame:06d}" else name
+
+
+def _vehicle_categories(file: CocoFile, source: Path, classes: Collection[str] | None) -> set[Any]:
+    """Ids of the categories that are vehicles; raise if there are annotations but no such category."""
+    wanted = VEHICLE_CLASSES if classes is None else classes
+    if file.annotations:
+        check_classes(source, file.categories.values(), wanted, "category")
+    return {number for number, name in file.categories.items() if name in wanted}
+
+
+def read_coco(
+    source: Path, classes: Collection[str] | None, truth: Path | None
+) -> tuple[list[tuple[str, Record]], list[FrameKey]]:
+    """Read the records of a data set or of results, each after its place, and the frames."""
+    file = _read_file(source, truth)
+    vehicles = _vehicle_categories(file, source, classes)
+    rows: list[tuple[str, Record]] = []
+    for number, entry in enumerate(file.annotations):
+        where = f"{source} annotation {number}"
+        try:
+            x, y, width, height = (parse_number(side, "bbox", where) for side in entry["bbox"])
+            category = entry["category_id"]
+            frame, name = file.images[entry["image_id"]], file.categories[category]
+        except (KeyError, TypeError, ValueError) as error:
+            raise DatasetError(
+                f"{where}: expected bbox [x, y, width, height] and the image_id and category_id of an image "
+                f"and a category in the file ({error})"
+            ) from None
+        if category not in vehicles and name not in LOOKALIKE_CLASSES:
+            continue
+        ignore = bool(entry.get("iscrowd") or entry.get("ignore") or category not in vehicles)
+        # An ignored box without a track would be a region.
+        track = entry.get("track_id", number if ignore and entry.get("score") is None else NO_TRACK)
+        # A crowd is a region, except for the ignored vehicles that are written here, which are marked twice.
+        if entry.get("iscrowd") and not (entry.get("ignore") and "track_id" in entry):
+            track = NO_TRACK
+        record = {name: entry.get(name) for name in TRACK_COLUMNS[6:]}
+        record |= {"frame": frame, "track_id": track, "ignore": ignore}
+        rows.append((where, record | dict(zip(CORNERS, (x, y, x + width, y + height)))))
+    return rows, list(file.images.values())
+
+
+def without_noise(value: float) -> float:
+    """Drop the rounding error of a sum or difference of coordinates: 50.25 - 10.1 becomes 40.15."""
+    return round(value, 9)
+
+
+def _image_entry(key: FrameKey, shape: tuple[int, ...] | None) -> dict[str, Any]:
+    """Describe a frame as a COCO image. Its id depends on nothing else, so that files agree about it.
+
+    The id is the frame's number plus 1; for a file name 52 bits of its hash, which every JSON reader holds
+    exactly. A video frame has no file, so that its number serves as the file name.
+    """
+    if isinstance(key, str):
+        image: dict[str, Any] = {
+            "id": int(hashlib.sha256(key.encode()).hexdigest()[:13], 16),
+            "file_name": key,
+        }
+    else:
+        image = {"id": key + 1, "file_name": f"{key:06d}", "frame": key}
+    return image if shape is None else image | {"height": int(shape[0]), "width": int(shape[1])}
+
+
+class Truth(NamedTuple):
+    """A ground truth whose ids are written."""
+
+    images: Mapping[FrameKey, Mapping[str, Any]]
+    category: Any = 1
+
+
+def read_truth(labels: TrackTable, truth: Path, *, results: bool) -> Truth:
+    """Images of the frames of a ground truth and, for `results`, its category of vehicles."""
+    file = _read_file(truth)
+    images = dict(zip(file.images.values(), file.entries))
+    keys = labels["frame"].tolist() if results else labels.frame_keys
+    unknown = next((key for key in keys if key not in images), None)
+    if unknown is not None:
+        such = f", which has images such as {next(iter(images))!r}" if images else ""
+        raise InvalidInputError(
+            f"labels hold frame {unknown!r}, which is not an image of {truth.name}{such}; "
+            "use the same names (labels.renamed), or drop these boxes"
+        )
+    if not results:
+        return Truth(images)
+    categories = _vehicle_categories(file, truth, None)
+    if len(categories) != 1:
+        listed = ", ".join(repr(file.categories[number]) for number in categories) or "none"
+        raise InvalidInputError(
+            f"truth must have one category of vehicles, as the boxes have none, got {listed}; join them with "
+            "write_labels(read_labels(truth), 'vehicles.json', truth=truth) and pass that file"
+        )
+    return Truth(images, categories.pop())
+
+
+def _result(record: Record, truth: Truth | None) -> Record:
+    """COCO result: box, score and, if known, track, distance, speed and confidence of one detection."""
+    image = _image_entry(record["frame"], None) if truth is None else truth.images[record["frame"]]
+    x1, y1, x2, y2 = (record[name] for name in CORNERS)
+    result: Record = {"image_id": image["id"], "category_id": 1 if truth is None else truth.category}
+    result["bbox"] = [x1, y1, without_noise(x2 - x1), without_noise(y2 - y1)]
+    known = {name: record.get(name) for name in ("score", "track_id", *TRACK_COLUMNS[7:])}
+    known |= {"track_id": None} if known["track_id"] == NO_TRACK else {}
+    return result | {name: value for name, value in known.items() if value is not None}
+
+
+@contextlib.contextmanager
+def open_coco(part: Path, shape: tuple[int, ...] | None, truth: Truth | None) -> Iterator[Write]:
+    """Write a data set: every frame is an image, every row an annotation. Images come last.
+
+    Ignored rows are crowds, because pycocotools overwrites ``ignore`` with ``iscrowd``.
+    """
+    frames: set[FrameKey] = set()
+    count = 0
+
+    def write(frame: FrameKey, records: Sequence[Record]) -> None:
+        nonlocal count
+        frames.add(frame)
+        for record in records:
+            count += 1
+            result, ignore = _result(record, truth), record.get("ignore", False)
+            width, height = result["bbox"][2:]
+            flags = {"area": round(width * height, 2), "iscrowd": int(ignore)}
+            flags |= {"ignore": 1} if ignore else {}
+            # An explicit null: readers number labels that name no track.
+            text = json.dumps({"id": count, "track_id": None} | result | flags, ensure_ascii=False)
+            file.write((", " if count > 1 else "") + text)
+
+    with part.open("w", encoding="utf-8", newline="") as file:
+        file.write('{"annotations": [')
+        yield write
+        ordered = sorted(frames, key=lambda key: (isinstance(key, str), key))
+        images = [_image_entry(key, shape) for key in ordered] if truth is None else [*truth.images.values()]
+        rest = json.dumps({"images": images, "categories": _CATEGORIES}, ensure_ascii=False)
+        file.write(f"], {rest[1:]}")
+
+
+@contextlib.contextmanager
+def open_coco_results(part: Path, truth: Truth | None) -> Iterator[Write]:
+    """Write the list of results that ``COCO.loadRes`` of pycocotools takes."""
+    results: list[Record] = []
+    yield lambda _, records: results.extend(_result(record, truth) for record in records)
+    part.write_text(json.dumps(results, ensure_ascii=False), encoding="utf-8")

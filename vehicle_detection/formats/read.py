@@ -1,0 +1,550 @@
+"""Read labels and predictions: CSV, JSON Lines, Parquet, KITTI, MOTChallenge, CVAT, COCO and YOLO.
+
+A reader turns a file into records (cells by the name of their column) with the place of each for messages.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import re
+import zipfile
+import zlib
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vehicle_detection._common import (
+    Limit,
+    check_choice,
+    check_path,
+    check_regular_file,
+    check_sequence,
+    check_shape,
+    describe,
+    read_regular_file,
+    shorten,
+)
+from vehicle_detection.boxes import clip_boxes, logit
+from vehicle_detection.datasets import FrameSet, load_frames
+from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection.formats.coco import Record, json_reason, read_coco, read_text
+from vehicle_detection.images import image_size, read_image
+from vehicle_detection.tables import (
+    BOX_COLUMNS,
+    CORNERS,
+    LABEL_COLUMNS,
+    NO_TRACK,
+    VEHICLE_CLASSES,
+    FrameKey,
+    TrackTable,
+    check_classes,
+    frame_order,
+    parse_cells,
+    parse_number,
+    without_suffix,
+)
+
+FORMATS = {
+    ".csv": "csv",
+    ".jsonl": "jsonl",
+    ".ndjson": "jsonl",
+    ".parquet": "parquet",
+    ".txt": "mot",
+    ".json": "coco",
+    ".zip": "mot_zip",
+}
+"""Format of each file name suffix."""
+FOLDER_FORMATS = ("kitti", "yolo")
+"""Formats that are folders, which are named instead of chosen by a suffix."""
+
+FRAME_NUMBER = re.compile(r"-?(0|[1-9][0-9]{0,17})(\.0*)?")
+"""Text of a frame that is a number. One with leading zeros is a file name."""
+PERSON_CLASSES = ("pedestrian", "person_sitting", "cyclist")
+
+_LABELS = ("frame", "track", *CORNERS)
+# The project's labels do not score vehicles that are largely hidden, truncated by more, or narrower (px).
+_HIDDEN, _MAX_TRUNCATED, _MIN_WIDTH = 2, 0.7, 40.0
+# Confidences of 0 and 1 have infinite log-odds.
+_MIN_CONFIDENCE = 1e-6
+
+
+class Found(NamedTuple):
+    """Rows of a file."""
+
+    places: list[str]  # file and line of each, for messages
+    cells: dict[str, list[Any]]  # of each column
+    frames: Sequence[FrameKey] = ()  # that the file lists; they may have no row
+
+
+def _found(rows: Iterable[tuple[str, Record]], frames: Sequence[FrameKey] = ()) -> Found:
+    """Collect records; a cell that a record lacks is missing."""
+    places, records = zip(*listed) if (listed := list(rows)) else ((), ())
+    names = dict.fromkeys(name for record in records for name in record) or BOX_COLUMNS[:-1]
+    return Found(list(places), {name: [record.get(name) for record in records] for name in names}, frames)
+
+
+def _read_lines(file: Path, text: str | None = None) -> Iterator[tuple[str, str]]:
+    """Yield the lines of a file, or of a text in it, that are not blank, after their places for messages."""
+    for number, line in enumerate((read_text(file) if text is None else text).splitlines(), 1):
+        if line.strip(", \t"):
+            yield f"{file} line {number}", line.strip()
+
+
+def _split_words(line: str) -> list[str]:
+    """Split a line at commas and white space."""
+    return re.split(r"\s*,\s*|\s+", line.strip())
+
+
+def _read_csv(source: Path, classes: Collection[str] | None) -> Found:
+    text = read_text(source)
+    separator = max(",;\t", key=text.split("\n", 1)[0].count)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
+    try:
+        lines = [(reader.line_num, line) for line in reader]
+    except csv.Error as error:
+        raise DatasetError(f"{source} line {reader.line_num}: not CSV text ({error})") from None
+    names = [" ".join(name.split()).lower() for name in lines[0][1]] if lines else []
+    twice = sorted({name for name in (*BOX_COLUMNS, *_LABELS, *LABEL_COLUMNS) if names.count(name) > 1})
+    if twice:
+        raise DatasetError(f"{source} has the column {', '.join(twice)} more than once; keep one of each")
+    lines = [(number, line) for number, line in lines[1:] if any(cell.strip() for cell in line)]
+    for number, line in lines:
+        if len(line) != len(names):
+            raise DatasetError(f"{source} line {number}: expected {len(names)} columns, found {len(line)}")
+    cells: dict[str, list[Any]] = {
+        name: [line[column].strip() for _, line in lines] for column, name in enumerate(names)
+    }
+    if all(map(FRAME_NUMBER.fullmatch, cells.get("frame", ["no number"]))):
+        cells["frame"] = [int(frame.partition(".")[0]) for frame in cells["frame"]]
+    return _checked(source, Found([f"{source} line {number}" for number, _ in lines], cells))
+
+
+def _checked(source: Path, found: Found) -> Found:
+    """Check that a table has the columns of labels, or those of predictions."""
+    scores = found.cells.get("score")
+    scored = scores is not None and not all(str(cell).lower() in ("", "nan", "none") for cell in scores)
+    tracked = not found.cells.keys().isdisjoint(("track", "track_id"))
+    expected = BOX_COLUMNS if scored or (scores is not None and not tracked) else _LABELS
+    missing = [name for name in expected if name not in found.cells and not (tracked and "track" in name)]
+    if missing:
+        listed = shorten(", ".join(found.cells), 300) or "an empty file"
+        raise DatasetError(
+            f"{source} lacks the columns {', '.join(missing)}; found {listed}; labels have "
+            f"{','.join(_LABELS)} and, optionally, {','.join(LABEL_COLUMNS)}; predictions "
+            f"{','.join(BOX_COLUMNS)}"
+        )
+    return found
+
+
+def _read_json_lines(source: Path, classes: Collection[str] | None) -> Found:
+    rows: list[tuple[str, Record]] = []
+    # Not splitlines, which also splits at other characters that a name may hold.
+    for number, line in enumerate(read_text(source).split("\n"), 1):
+        where = f"{source} line {number}"
+        if line.strip():
+            try:
+                rows.append((where, json.loads(line)))
+            except (ValueError, RecursionError) as error:
+                raise DatasetError(f"{where}: not a JSON object ({json_reason(error)})") from None
+            if not isinstance(rows[-1][1], dict):
+                raise DatasetError(f"{where}: expected a JSON object, found {line.strip()[:40]!r}")
+    return _checked(source, _found(rows)) if rows else _found(rows)
+
+
+def _read_parquet(source: Path, classes: Collection[str] | None) -> Found:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise InvalidInputError(
+            "a .parquet file needs pyarrow; pip install pyarrow, or convert it to .csv"
+        ) from None
+    check_regular_file(source, str(source), Limit.TEXT_BYTES, error=DatasetError)
+    try:
+        table = pyarrow.parquet.read_table(source)
+    except (pyarrow.ArrowException, OSError) as error:
+        raise DatasetError(f"{source} is not a Parquet file: {' '.join(str(error).split())}") from None
+    places = [f"{source} row {number}" for number in range(table.num_rows)]
+    return _checked(source, Found(places, table.to_pydict()))
+
+
+def _read_kitti(source: Path, classes: Collection[str] | None) -> Found:
+    files = list(source.glob("*.txt")) if source.is_dir() else [source]
+    if not files:
+        raise _no_text_files(source, "a KITTI label_2 folder or a label file")
+    rows: list[tuple[str, Record]] = []
+    for file in sorted(files, key=lambda file: frame_order(file.name)):
+        for where, line in _read_lines(file):
+            record = _kitti_record(where, line.split(), classes)
+            if record is not None:
+                # An ignored box without a track would be a region.
+                track = len(rows) if record["ignore"] and record["region"] is False else NO_TRACK
+                rows.append((where, {"frame": file.stem, "track_id": track, **record}))
+    return _found(rows, [file.stem for file in files])
+
+
+def _no_text_files(folder: Path, expected: str) -> DatasetError:
+    """Error of a folder without text files, which names a subfolder that has some, such as labels/train."""
+    inside = min((file.parent for file in folder.glob("*/*.txt")), default=None)
+    remedy = f"name {expected}" if inside is None else f"its subfolders are read one at a time: name {inside}"
+    return DatasetError(f"{folder} holds no .txt file; {remedy}")
+
+
+def _kitti_record(where: str, words: list[str], classes: Collection[str] | None) -> Record | None:
+    """One KITTI object; None for a person."""
+    if len(words) not in (15, 16):
+        raise DatasetError(f"{where}: a KITTI object has 15 values (16 with a score), found {len(words)}")
+    name = words[0].lower()
+    corners = [parse_number(word, "corner of the box", where) for word in words[4:8]]
+    score = words[15] if len(words) == 16 else None
+    record = {**dict(zip(CORNERS, corners)), "score": score, "ignore": True, "region": name == "dontcare"}
+    wanted = name in (VEHICLE_CLASSES if classes is None else classes)
+    if record["region"] or (not wanted and name in PERSON_CLASSES):
+        return record if record["region"] else None
+    # Results hold -1 for unknown values; an occlusion of 3 is KITTI's "unknown".
+    truncated = min(max(parse_number(words[1], "truncated", where), 0.0), 1.0)
+    occluded = min(max(int(parse_number(words[2], "occluded", where)), 0), _HIDDEN)
+    unscored = occluded >= _HIDDEN or truncated > _MAX_TRUNCATED or corners[2] - corners[0] < _MIN_WIDTH
+    ignore = not wanted or (unscored and score is None)
+    return record | {"occluded": occluded, "truncated": truncated, "ignore": ignore}
+
+
+def _read_mot(source: Path, classes: Collection[str] | None) -> Found:
+    rows = list(_mot_rows(_read_lines(source)))
+    if classes is not None and rows:
+        found = {number for *_, number in rows if number is not None}
+        if not found:
+            raise DatasetError(f"{source} holds predictions, which have no classes; leave out classes=")
+        check_classes(source, found, classes)
+    return _found((where, record) for where, record, number in rows if classes is None or number in classes)
+
+
+def _mot_rows(
+    lines: Iterable[tuple[str, str]], *, first_pixel: int = 1
+) -> Iterator[tuple[str, Record, str | None]]:
+    """Yield each row of MOTChallenge text with its class number; predictions have none."""
+    for where, line in lines:
+        words = _split_words(line.rstrip(","))
+        if len(words) < 6:
+            raise DatasetError(f"{where}: expected frame, id, x, y, width, height, found {len(words)} values")
+        frame = parse_number(words[0], "frame (counted from 1)", where)
+        if frame < 1 or frame != int(frame):
+            raise DatasetError(
+                f"{where}: frame (counted from 1) must be at least 1, got {describe(words[0])}"
+            )
+        x, y, width, height = (parse_number(word, "side of the box", where) for word in words[2:6])
+        x, y = x - first_pixel, y - first_pixel
+        record: Record = {"frame": int(frame) - 1, "track_id": words[1]}
+        record |= zip(CORNERS, (x, y, x + width, y + height))
+        # Ground truth has nine columns, the last ones flag, class, visibility. Results have class -1 or ten.
+        if len(words) == 9 and words[7] != "-1":
+            yield where, record | {"ignore": parse_number(words[6], "flag", where) == 0}, words[7]
+        else:
+            yield where, record | {"score": words[6] if len(words) > 6 else None}, None
+
+
+def _read_mot_zip(source: Path, classes: Collection[str] | None) -> Found:
+    """Read an archive of CVAT: MOTChallenge text whose pixels count from 0, and the names of the classes."""
+    text, names = _read_members(source, "gt/gt.txt", "gt/labels.txt")
+    if text is None:
+        raise DatasetError(f"{source} is not an archive of CVAT: it lacks gt/gt.txt; export MOT 1.1 there")
+    wanted = VEHICLE_CLASSES if classes is None else classes
+    labels = [name.strip().lower() for name in (names or "").splitlines() if name.strip()]
+    if labels:
+        check_classes(source, labels, wanted)
+    rows = []
+    for where, record, number in _mot_rows(_read_lines(source, text), first_pixel=0):
+        if labels and number is not None:
+            index = parse_number(number, "class", where)
+            if index not in range(1, len(labels) + 1):
+                raise DatasetError(
+                    f"{where}: class must be at most {len(labels)}, as in gt/labels.txt, got {number}"
+                )
+            if labels[int(index) - 1] not in wanted:
+                continue
+        rows.append((where, record))
+    return _found(rows)
+
+
+def _read_members(source: Path, *names: str) -> list[str | None]:
+    """Read text files of an archive; None for each that it lacks."""
+    check_regular_file(source, str(source), Limit.TEXT_BYTES, error=DatasetError)
+    limit = Limit.TEXT_BYTES.current()
+    try:
+        with zipfile.ZipFile(source) as archive:
+            known = {info.filename: info for info in archive.infolist()}
+            for name in names:
+                if name in known and known[name].file_size > limit:
+                    raise DatasetError(
+                        f"{source}: {name} is larger than {limit:,} bytes; if it is meant to be so large, "
+                        f"set {Limit.TEXT_BYTES.variable}"
+                    )
+            return [archive.read(name).decode("utf-8-sig") if name in known else None for name in names]
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, RuntimeError, OSError) as error:
+        raise DatasetError(f"{source} is not a zip archive that can be read ({error})") from None
+    except UnicodeDecodeError:
+        raise DatasetError(f"{source} does not hold UTF-8 text; save it as UTF-8") from None
+
+
+def _read_yolo(source: Path, classes: Collection[str] | None, shape: Any, images: FrameSet | None) -> Found:
+    """Read a text file for each frame; the names of the classes are beside their folder, or unknown."""
+    if shape is None and images is None:
+        raise InvalidInputError(
+            "shape must be (height, width) of the frames for YOLO, got None; pass it, or the folder of "
+            "the images as images= or --images"
+        )
+    folder = source / "labels" if (source / "labels").is_dir() else source
+    files = [file for file in folder.glob("*.txt") if file.name != "classes.txt"]
+    without_frames = folder != source and not any(folder.iterdir())
+    if not files and not without_frames:
+        raise _no_text_files(folder, "a folder of YOLO labels")
+    names = _yolo_names(source)
+    wanted = VEHICLE_CLASSES if classes is None else classes
+    if names:
+        check_classes(source, names.values(), wanted)
+    files.sort(key=lambda file: frame_order(file.name))
+    frames = _yolo_frames(files, shape) if images is None else _yolo_images(files, images)
+    rows: list[tuple[str, Record]] = []
+    numbers: set[str] = set()
+    for file, (key, size) in zip(files, frames, strict=True):
+        for where, line in _read_lines(file):
+            name, record = _yolo_record(where, line.split(), size)
+            # Without names, classes are numbers, and by default all of them are vehicles.
+            numbers.add(name)
+            if (not names and classes is None) or names.get(name, name) in wanted:
+                rows.append((where, {"frame": key, **record}))
+    if not names and classes is not None and numbers:
+        check_classes(source, numbers, wanted)
+    return _found(rows, [key for key, _ in frames])
+
+
+def _yolo_frames(files: Sequence[Path], shape: Any) -> list[tuple[FrameKey, tuple[int, ...]]]:
+    """Frame and shape of each file, all of one shape: numbers if all names have six digits."""
+    shape = check_shape(shape)
+    numbered = all(file.stem.isdecimal() and file.stem == f"{int(file.stem):06d}" for file in files)
+    return [(int(file.stem) if numbered else file.stem, shape) for file in files]
+
+
+def _yolo_images(files: Sequence[Path], images: FrameSet) -> list[tuple[FrameKey, tuple[int, ...]]]:
+    """Name and shape of the image of each file; the header has the shape, unless EXIF data may rotate it."""
+    names = {without_suffix(name): name for name in images.names}
+    frames: list[tuple[FrameKey, tuple[int, ...]]] = []
+    for file in files:
+        if file.stem not in names:
+            raise DatasetError(f"{file} has no image in {images.folder}; pass the folder of its image")
+        image = images.folder / names[file.stem]
+        data = read_regular_file(image, f"image file {image}", Limit.IMAGE_BYTES, error=DatasetError)
+        size = None if b"exif" in data.lower() else image_size(data)
+        frames.append((image.name, read_image(image).shape[:2] if size is None else size[::-1]))
+    return frames
+
+
+def _yolo_record(where: str, words: list[str], shape: tuple[int, ...]) -> tuple[str, Record]:
+    """Class and record of a line: class, center, size and, for predictions, confidence and track."""
+    if not 5 <= len(words) <= 7:
+        raise DatasetError(
+            f"{where}: expected class, center and size, and perhaps confidence and track, found {len(words)} "
+            "values"
+        )
+    x, y, width, height = (parse_number(word, "side of the box", where) for word in words[1:5])
+    if len(words) == 5 and not (abs(x - 0.5) < (1 + width) / 2 and abs(y - 0.5) < (1 + height) / 2):
+        raise DatasetError(
+            f"{where}: the box {' '.join(words[1:5])} lies outside the image; center and size are fractions "
+            "of the image in YOLO"
+        )
+    x, width, y, height = x * shape[1], width * shape[1], y * shape[0], height * shape[0]
+    corners = np.array([[x - width / 2, y - height / 2, x + width / 2, y + height / 2]])
+    record: Record = dict(zip(CORNERS, clip_boxes(corners, shape)[0].tolist()))
+    if len(words) > 5:
+        confidence = parse_number(words[5], "confidence", where)
+        if not 0 <= confidence <= 1:
+            raise DatasetError(f"{where}: confidence must be from 0 to 1, got {describe(words[5])}")
+        record["score"] = logit(min(max(confidence, _MIN_CONFIDENCE), 1 - _MIN_CONFIDENCE))
+        record["track_id"] = words[6] if len(words) > 6 else None
+    name = words[0].partition(".")[0] if FRAME_NUMBER.fullmatch(words[0]) else words[0]
+    return name, record
+
+
+def _yolo_names(source: Path) -> dict[str, str]:
+    """Lower-case name of each class number, from ``data.yaml`` or ``classes.txt``; empty if unknown."""
+    place = source.resolve()
+    for folder in (place, *place.parents[:2]):
+        if (folder / "data.yaml").is_file():
+            return _yaml_names(folder / "data.yaml")
+        if (folder / "classes.txt").is_file():
+            lines = read_text(folder / "classes.txt").splitlines()
+            return {str(number): name.strip().lower() for number, name in enumerate(lines)}
+    return {}
+
+
+def _yaml_names(file: Path) -> dict[str, str]:
+    """Value of ``names``: a list, or a mapping from numbers."""
+    import yaml
+
+    try:
+        data = next(yaml.safe_load_all(read_text(file)), None)  # of several documents, the first
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise DatasetError(f"{file} is not YAML text: {' '.join(str(error).split())}") from None
+    names = data.get("names") if isinstance(data, dict) else None
+    if not names or not isinstance(names, (list, dict)):
+        raise DatasetError(f"{file} names no class; write them as names: [car, bus]")
+    listed = enumerate(names) if isinstance(names, list) else names.items()
+    return {str(number): str(name).lower() for number, name in listed}
+
+
+_READERS = {
+    "csv": _read_csv,
+    "jsonl": _read_json_lines,
+    "parquet": _read_parquet,
+    "kitti": _read_kitti,
+    "mot": _read_mot,
+    "mot_zip": _read_mot_zip,
+}
+_READ_FORMATS = (*dict.fromkeys(FORMATS.values()), "coco_results", *FOLDER_FORMATS)
+
+
+def read_labels(
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,  # noqa: A002
+    classes: Collection[str] | None = None,
+    shape: tuple[int, ...] | None = None,
+    truth: str | os.PathLike[str] | None = None,
+    images: str | os.PathLike[str] | None = None,
+) -> TrackTable:
+    """Read labelled or predicted boxes from a file or folder; `write_labels` writes them.
+
+    Parameters
+    ----------
+    path
+        A CSV file (``frame,track,x1,y1,x2,y2[,occluded,truncated,ignore]``, where ``track_id`` may stand for
+        ``track``, or, for predictions, the columns of `write_tracks`; separated by commas, semicolons or
+        tabs; with a column ``class``, ``label`` or ``category`` of names, rows of other classes than vehicles
+        are left out), a JSON Lines or Parquet (needs pyarrow) file with these columns, a KITTI ``label_2``
+        folder, a MOTChallenge text file, the MOT archive of CVAT, a COCO JSON file, a list of COCO results,
+        or a YOLO folder: ``labels/*.txt``, with class names in ``data.yaml`` or ``classes.txt``.
+    format
+        ``"csv"``, ``"jsonl"``, ``"parquet"``, ``"kitti"``, ``"mot"``, ``"mot_zip"``, ``"coco"``,
+        ``"coco_results"`` or ``"yolo"``; None chooses by suffix and content.
+    classes
+        KITTI types, COCO category names, class names of tables, CVAT and YOLO, or class numbers of MOT files
+        and of YOLO folders without names, that are vehicles, in upper or lower case. None takes car, van,
+        truck, bus and vehicle, and every row of files with numbers.
+    shape
+        ``(height, width, ...)`` of the frames, to which boxes are clipped. None does not clip them. YOLO
+        needs it, or `images`.
+    truth
+        The COCO data set whose image and category ids a list of COCO results has; not read otherwise.
+    images
+        The folder of the images of a YOLO folder, which may differ in size, instead of `shape`; not used
+        otherwise.
+
+    Returns
+    -------
+    TrackTable
+        CSV frames are int if all of them are whole numbers, else str. KITTI frames are the files' names
+        without ``.txt``, COCO frames the images' ``file_name``. Frames and pixels of MOT files count from 1
+        and are returned from 0. YOLO frames are the files' names without ``.txt``, or numbers if all have six
+        digits, or with `images` the images' file names; a confidence becomes its log-odds.
+
+    Raises
+    ------
+    DatasetError
+        If the file is missing, has none of these formats, names no class of vehicles, or holds an invalid
+        row; the message names the line.
+    InvalidInputError
+        If `path`, `format` or `shape` is none of the values above, or pyarrow is missing.
+
+    Notes
+    -----
+    KITTI's ``DontCare`` and COCO's crowds become regions; trams, trailers and the like become ignored boxes,
+    as do KITTI's vehicles that are largely hidden, truncated by more than 0.7 or narrower than 40 px, the
+    same rule as in the project's labels. Persons and all other classes are left out. A MOT file with nine
+    columns is ground truth, whose rows with flag 0 are ignored; in others column seven is the score.
+
+    Examples
+    --------
+    >>> read_labels("labels/missing.csv")
+    Traceback (most recent call last):
+    ...
+    vehicle_detection.errors.DatasetError: labels/missing.csv does not exist; check the path
+    """
+    source = check_path(path, "path", kind="a file or folder")
+    pictures = None
+    if images is not None:
+        pictures = load_frames(check_path(images, "images", kind="the folder of the images"))
+    if format is not None:
+        check_choice(format, "format", _READ_FORMATS)
+    if not source.exists():
+        raise DatasetError(f"{source} does not exist; check the path")
+    kind = format or _guess_format(source)
+    if source.is_dir() and kind not in FOLDER_FORMATS:
+        raise DatasetError(
+            f"{source} is a folder, and {kind} labels are one file; pass the path of that file"
+        )
+    chosen = None
+    if classes is not None:
+        chosen = frozenset(str(name).lower() for name in check_sequence(classes, "classes", "names"))
+    if kind in ("coco", "coco_results"):  # told apart by their content
+        found = _found(*read_coco(source, chosen, None if truth is None else check_path(truth, "truth")))
+    elif kind == "yolo":
+        found, shape = _read_yolo(source, chosen, shape, pictures), None  # its boxes are clipped
+    else:
+        found = _READERS[kind](source, chosen)
+    return _table_of(source, found, chosen, shape)
+
+
+def _table_of(
+    source: Path, found: Found, classes: Collection[str] | None, shape: tuple[int, ...] | None
+) -> TrackTable:
+    """Check the rows of any format, clip their boxes to `shape`, and return them as a table."""
+    columns, places = parse_cells(found.cells, source, found.places, classes=classes)
+    boxes, labelled = columns["boxes"], "score" not in columns
+    # A prediction clipped at the border may have no area; a label without area is a mistake.
+    sides = boxes[:, 2:] - boxes[:, :2]
+    wrong = np.flatnonzero(((sides < 0) | (labelled & (sides == 0))).any(axis=1))
+    if wrong.size:
+        raise DatasetError(
+            f"{places[wrong[0]]}: a box needs x1 < x2 and y1 < y2, got {boxes[wrong[0]].tolist()}"
+        )
+    first: dict[tuple[FrameKey, int], str] = {}
+    for frame, track, place in zip(columns["frame"], columns.get("track_id", np.empty(0)).tolist(), places):
+        before = place if track == NO_TRACK else first.setdefault((frame, track), place)
+        if before != place:
+            raise DatasetError(
+                f"{place}: track {track} comes twice in frame {describe(frame)}, first at {before}"
+            )
+    if shape is not None:
+        columns["boxes"] = clip_boxes(boxes, shape)
+        gone = np.flatnonzero((columns["boxes"][:, :2] == columns["boxes"][:, 2:]).any(axis=1))
+        if gone.size and labelled:
+            raise DatasetError(
+                f"{places[gone[0]]}: box {boxes[gone[0]].tolist()} lies outside the {shape[1]}x{shape[0]} "
+                "image; check that shape is (height, width) of these frames"
+            )
+    return TrackTable(**columns | {"frame_keys": (*columns["frame_keys"], *found.frames)})
+
+
+def _guess_format(source: Path) -> str:
+    """Choose the format by the suffix or else by the first line."""
+    if source.is_dir():
+        named = ("labels", "data.yaml", "classes.txt")
+        if any((source / name).exists() for name in named):
+            return "yolo"
+        lines = (line for file in source.glob("*.txt") for _, line in _read_lines(file))
+        return "yolo" if 5 <= len(next(lines, "").split()) <= 7 else "kitti"
+    suffix = source.suffix.lower()
+    if suffix == ".tsv" or (suffix in FORMATS and suffix != ".txt"):
+        return FORMATS.get(suffix, "csv")
+    start = read_text(source).lstrip()[:4096]
+    words = _split_words(start.splitlines()[0]) if start else []
+    if start.startswith(("{", "[")):
+        return "coco"
+    if not words or re.fullmatch(r"[0-9]+(\.0*)?", words[0]):
+        return "mot"
+    return "kitti" if len(words) >= 15 and "frame" not in words else "csv"

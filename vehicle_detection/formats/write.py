@@ -1,0 +1,641 @@
+"""Write tables of tracks, detections and labels in each format, also while a video is processed."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import math
+import os
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vehicle_detection._common import (
+    atomic_write,
+    check_choice,
+    check_number,
+    check_target,
+    check_type,
+    describe,
+    is_listing,
+    temporary_folder,
+)
+from vehicle_detection.boxes import clip_boxes
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.formats.coco import (
+    Record,
+    Truth,
+    Write,
+    open_coco,
+    open_coco_results,
+    read_truth,
+    without_noise,
+)
+from vehicle_detection.formats.read import FOLDER_FORMATS, FORMATS, FRAME_NUMBER
+from vehicle_detection.tables import (
+    BOX_COLUMNS,
+    CORNERS,
+    NO_TRACK,
+    TRACK_COLUMNS,
+    FrameKey,
+    TrackTable,
+    is_result,
+    shown_tracks,
+    without_suffix,
+)
+
+TIME_COLUMN = "time_s"
+DIGITS = dict(zip((*TRACK_COLUMNS[2:], TIME_COLUMN), (2, 2, 2, 2, 4, 2, 2, 4, 2, 2, 3)))
+"""Decimals of each column of a table of tracks."""
+STILL_COLUMNS = (*BOX_COLUMNS, "confidence")
+
+_TRACK_FORMATS = (*dict.fromkeys(FORMATS.values()), "yolo")
+_STILL_FORMATS = ("csv", "jsonl", "parquet", "coco", "yolo")
+
+# Rows of a Parquet file that are written at once, which bounds the memory.
+_ROWS_PER_GROUP = 50_000
+# Pixels by which a box may extend beyond its image, from rounding.
+_ROUNDING = 1.0
+
+
+def _round(record: Record) -> Record:
+    """Round to the decimals of a table of tracks; + 0.0 turns -0.0 into 0.0."""
+    return {
+        name: value if name not in DIGITS or value is None else round(value, DIGITS[name]) + 0.0
+        for name, value in record.items()
+    }
+
+
+def track_records(result: Any, columns: Sequence[str] = TRACK_COLUMNS) -> list[Record]:
+    """Return the rounded rows of the shown tracks of a frame's result."""
+    if not is_result(result):
+        raise InvalidInputError(
+            f"results must be FrameResult objects, got {describe(result)}; "
+            "collect rows in a TrackTable, a pandas table with TrackTable.from_pandas"
+        )
+    records = []
+    for track in shown_tracks(result.tracks):
+        record: Record = {"frame": int(result.index), "track_id": int(track.id)}
+        record |= zip(CORNERS, map(float, track.box))
+        for name in columns[6:]:
+            value = getattr(track, name, None)
+            record[name] = None if value is None or math.isnan(value) else float(value)
+        records.append(_round(record))
+    return records
+
+
+def _table_records(table: TrackTable, columns: Sequence[str]) -> list[Record]:
+    values = [
+        [None if isinstance(value, float) and math.isnan(value) else value for value in table[name].tolist()]
+        for name in columns
+    ]
+    return [dict(zip(columns, row)) for row in zip(*values)]
+
+
+def _write_table(table: TrackTable, records: Iterable[Record], write: Write) -> None:
+    """Write all frames, some of which may be empty, then the rows in their order."""
+    for key in table.frame_keys:
+        write(key, ())
+    for key, rows in groupby(records, lambda record: record["frame"]):
+        write(key, list(rows))
+
+
+class _Target(NamedTuple):
+    """What a format needs to know of the rows."""
+
+    path: Path
+    columns: Sequence[str]
+    shape: tuple[int, ...] | None = None
+    named: bool = False  # whether frames have names
+    rounded: bool = False  # to `DIGITS`
+    truth: Truth | None = None  # of COCO files
+
+
+@contextlib.contextmanager
+def _open_csv(part: Path, target: _Target) -> Iterator[Write]:
+    digits = DIGITS if target.rounded else {}
+
+    def cell(name: str, value: Any) -> Any:
+        if value is None or isinstance(value, bool):
+            return "" if value is None else int(value)
+        return f"{value:.{digits[name]}f}" if name in digits else value
+
+    with part.open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(target.columns)
+        yield lambda _, records: table.writerows(
+            [cell(name, record[name]) for name in target.columns] for record in records
+        )
+
+
+@contextlib.contextmanager
+def _open_json_lines(part: Path, target: _Target) -> Iterator[Write]:
+    with part.open("w", encoding="utf-8", newline="") as file:
+        yield lambda _, records: file.writelines(
+            json.dumps({name: record[name] for name in target.columns}, ensure_ascii=False) + "\n"
+            for record in records
+        )
+
+
+@contextlib.contextmanager
+def _open_parquet(part: Path, target: _Target) -> Iterator[Write]:
+    types = {"frame": "string" if target.named else "int64", "track_id": "int64", "occluded": "int64"}
+    types |= {"ignore": "bool", "trip": "string"}
+    with open_parquet(part, {name: types.get(name, "double") for name in target.columns}) as write:
+        yield lambda _, records: write(records)
+
+
+def import_pyarrow() -> Any:
+    """Return the package pyarrow; raise an error with the remedy if it is missing."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise InvalidInputError(".parquet files need pyarrow; pip install pyarrow") from None
+    return pyarrow
+
+
+@contextlib.contextmanager
+def open_parquet(path: Path, types: Mapping[str, str]) -> Iterator[Callable[[Iterable[Record]], None]]:
+    """Yield a function that adds rows to a Parquet file, in constant memory.
+
+    `types` maps the names of the columns to Arrow types, such as ``"int64"``.
+    """
+    pyarrow = import_pyarrow()
+    schema = pyarrow.schema(list(types.items()))
+    waiting: list[Record] = []
+
+    def flush() -> None:
+        writer.write_table(pyarrow.Table.from_pylist(waiting, schema=schema))
+        waiting.clear()
+
+    def write(records: Iterable[Record]) -> None:
+        waiting.extend(records)
+        if len(waiting) >= _ROWS_PER_GROUP:
+            flush()
+
+    with pyarrow.parquet.ParquetWriter(path, schema) as writer:
+        yield write
+        flush()
+
+
+def _mot_line(record: Record, *, first_pixel: int = 1, vehicle_class: int = 3, scores: bool = True) -> str:
+    """MOTChallenge text of a row, whose frames count from 1: a result, or without score a label.
+
+    Both start with frame, id, left, top, width and height. A result goes on with its score and no world
+    position, a label with its flag (0 if ignored), its class (3 is a car) and its visible fraction.
+    """
+    x1, y1, x2, y2 = (record[name] for name in CORNERS)
+    box = (without_noise(side) for side in (x1 + first_pixel, y1 + first_pixel, x2 - x1, y2 - y1))
+    if scores and record.get("score") is not None:
+        end: tuple[Any, ...] = (record["score"], -1, -1, -1)
+    else:
+        hidden = min(record.get("occluded", 0), 2) / 2
+        visible = round((1 - record.get("truncated", 0.0)) * (1 - hidden), 2)
+        end = (int(not record.get("ignore", False)), vehicle_class, visible)
+    return ",".join(map(str, (record["frame"] + 1, record["track_id"], *box, *end))) + "\n"
+
+
+@contextlib.contextmanager
+def _open_mot(part: Path, target: _Target) -> Iterator[Write]:
+    with part.open("w", encoding="utf-8", newline="") as file:
+        yield lambda _, records: file.writelines(map(_mot_line, records))
+
+
+@contextlib.contextmanager
+def _open_mot_zip(part: Path, target: _Target) -> Iterator[Write]:
+    """Archive of ground truth as CVAT writes it: pixels count from 0, and class 1 is the first label."""
+    with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
+        with (
+            archive.open("gt/gt.txt", "w") as binary,
+            io.TextIOWrapper(binary, "utf-8", newline="\n") as text,
+        ):
+            yield lambda _, records: text.writelines(
+                _mot_line(record, first_pixel=0, vehicle_class=1, scores=False) for record in records
+            )
+        # Without the time of day, as the other member: the same tracks give the same archive.
+        archive.writestr(zipfile.ZipInfo("gt/labels.txt"), "vehicle\n")
+
+
+def _folder_writer(
+    folder: Path, name: Callable[[FrameKey], str], line: Callable[[Record], str], kind: str
+) -> Write:
+    """Write a text file for each frame, which stays empty without rows."""
+    frames: dict[str, FrameKey] = {}
+
+    def write(frame: FrameKey, records: Sequence[Record]) -> None:
+        other = frames.setdefault(name(frame), frame)
+        if other != frame:
+            raise InvalidInputError(
+                f"path cannot hold the frames {other!r} and {frame!r}, which are one file in {kind}; "
+                "rename them"
+            )
+        with (folder / f"{name(frame)}.txt").open("a", encoding="utf-8", newline="") as file:
+            file.writelines(map(line, records))
+
+    return write
+
+
+@contextlib.contextmanager
+def _open_yolo(part: Path, target: _Target) -> Iterator[Write]:
+    """Lines of class, center and size as fractions of the frame, confidence and track; labels have five."""
+    if target.shape is None:
+        raise InvalidInputError("shape must be (height, width) of the frames for YOLO, got None; pass it")
+    height, width = target.shape[:2]
+
+    def line(record: Record) -> str:
+        x1, y1, x2, y2 = (record[name] for name in CORNERS)
+        numbers = [(x1 + x2) / 2 / width, (y1 + y2) / 2 / height, (x2 - x1) / width, (y2 - y1) / height]
+        track: list[str] = []
+        if record.get("score") is not None:
+            # math.exp overflows beyond 709.
+            known = record.get("confidence")
+            numbers.append(1 / (1 + math.exp(min(-record["score"], 700))) if known is None else known)
+            track = [] if record["track_id"] in (None, NO_TRACK) else [str(record["track_id"])]
+        return " ".join(["0", *(f"{number:.6f}" for number in numbers), *track]) + "\n"
+
+    (part / "labels").mkdir()
+    (part / "data.yaml").write_text("names:\n  0: vehicle\n", encoding="utf-8", newline="\n")
+    yield _folder_writer(
+        part / "labels", lambda key: Path(key).stem if isinstance(key, str) else f"{key:06d}", line, "YOLO"
+    )
+
+
+@contextlib.contextmanager
+def _open_kitti(part: Path, target: _Target) -> Iterator[Write]:
+    """``label_2`` files, in which angle, size and place in 3D are unknown."""
+
+    def line(record: Record) -> str:
+        name = "DontCare" if record.get("ignore", False) else "Car"
+        words = [name, record.get("truncated", 0.0), record.get("occluded", 0), -10]
+        words += [*(record[side] for side in CORNERS), "-1 -1 -1 -1000 -1000 -1000 -10"]
+        words += [] if record.get("score") is None else [record["score"]]
+        return " ".join(map(str, words)) + "\n"
+
+    yield _folder_writer(part, lambda key: without_suffix(str(key)), line, "KITTI")
+
+
+_WRITERS: dict[str, Callable[[Path, _Target], contextlib.AbstractContextManager[Write]]] = {
+    "csv": _open_csv,
+    "jsonl": _open_json_lines,
+    "parquet": _open_parquet,
+    "mot": _open_mot,
+    "mot_zip": _open_mot_zip,
+    "coco": lambda part, target: open_coco(part, target.shape, target.truth),
+    "coco_results": lambda part, target: open_coco_results(part, target.truth),
+    "kitti": _open_kitti,
+    "yolo": _open_yolo,
+}
+
+
+@contextlib.contextmanager
+def _open_target(kind: str, target: _Target) -> Iterator[Write]:
+    """Open a file or folder, which appears when the block ends without an error, and is removed otherwise."""
+    folder = kind in FOLDER_FORMATS
+    place = _new_folder(target.path, kind.upper()) if folder else atomic_write(target.path, "path")
+    with place as part, _WRITERS[kind](part, target) as write:
+        yield write
+
+
+@contextlib.contextmanager
+def _new_folder(path: Path, kind: str) -> Iterator[Path]:
+    """Yield a temporary folder, which becomes `path`, a new or empty folder, if the block succeeds."""
+    if path.is_file() or (path.is_dir() and any(path.iterdir())):
+        raise InvalidInputError(f"path must be a new or empty folder for {kind}, got {path}; choose another")
+    if not path.parent.is_dir():
+        raise InvalidInputError(
+            f"path needs an existing folder, {describe(str(path.parent))} is not one; create it first"
+        )
+    with temporary_folder(path.parent, path.name[:32]) as temporary:
+        part = temporary / "new"
+        part.mkdir()
+        yield part
+        if path.is_dir():
+            path.rmdir()
+        part.replace(path)
+
+
+def _check_format(path: object, name: str | None, allowed: Iterable[str]) -> str:
+    """Choose the format by its name or the suffix, and check the target before any work is done."""
+    if not isinstance(path, (str, os.PathLike)):
+        raise InvalidInputError(
+            f"path must be a file name, got {describe(path)}; pass a name such as 'tracks.csv'"
+        )
+    choices = tuple(dict.fromkeys(allowed))
+    kind = FORMATS.get(Path(path).suffix.lower()) if name is None else name
+    if name is None and kind not in choices:
+        suffixes = [suffix for suffix, meant in FORMATS.items() if meant in choices]
+        raise InvalidInputError(
+            f"path must end in {', '.join(suffixes)}, got {Path(path).name!r}; "
+            f"or set the format to {', '.join(map(repr, choices))}"
+        )
+    check_choice(kind, "format", choices)
+    if kind not in FOLDER_FORMATS:
+        check_target(path, "path")
+    return str(kind)
+
+
+class TrackStream:
+    """Rows of a video that are written while it is processed; see `open_tracks`."""
+
+    def __init__(self, write: Write, fps: float | None) -> None:
+        self._write, self._fps = write, fps
+        self._last = -1
+        self.rows = 0
+
+    def __call__(self, result: Any) -> None:
+        """Write the shown tracks of the next frame's result."""
+        records = track_records(result)
+        frame = int(result.index)
+        if frame <= self._last:
+            raise InvalidInputError(
+                f"frame must be greater than {self._last}, the last one, got {frame}; "
+                "write each frame once, and each video to a file of its own"
+            )
+        self._last = frame
+        time = None if self._fps is None else round(frame / self._fps, DIGITS[TIME_COLUMN])
+        self._write(frame, [{**record, TIME_COLUMN: time} for record in records])
+        self.rows += len(records)
+
+
+@contextlib.contextmanager
+def open_tracks(
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,  # noqa: A002 - the name that pandas and Pillow use
+    shape: tuple[int, ...] | None = None,
+    fps: float | None = None,
+) -> Iterator[TrackStream]:
+    """Open a file for the tracks of a video that is being processed, in constant memory.
+
+    The file appears when the ``with`` block ends without an error; otherwise an existing file is kept.
+
+    Parameters
+    ----------
+    path, format, shape, fps
+        As in `write_tracks`.
+
+    Yields
+    ------
+    TrackStream
+        Function that takes the :class:`FrameResult` of each frame; its ``rows`` counts those written so far.
+
+    Raises
+    ------
+    InvalidInputError
+        As in `write_tracks`.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from vehicle_detection import Detections, FrameResult, Tracker
+    >>> found, tracker = Detections([[10, 20, 50, 60]], [1.5]), Tracker(fps=25)
+    >>> file = Path(tempfile.mkdtemp()) / "tracks.csv"
+    >>> with open_tracks(file) as write:  # or: process_video(..., on_result=write)
+    ...     for frame in range(20):
+    ...         tracks = tracker.update(found, (720, 1280, 3))
+    ...         write(FrameResult(frame, frame / 25, found, found, tracks))
+    >>> print(file.read_text().splitlines()[0])
+    frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps,confidence,distance_std_m,speed_std_mps
+    """
+    kind = _check_format(path, format, _TRACK_FORMATS)
+    rate = None if fps is None else check_number(fps, "fps", above=0, high=1e6)
+    columns = TRACK_COLUMNS if rate is None else (*TRACK_COLUMNS, TIME_COLUMN)
+    with _open_target(kind, _Target(Path(path), columns, shape, rounded=True)) as write:
+        yield TrackStream(write, rate)
+
+
+def write_tracks(
+    results: Iterable[Any] | TrackTable,
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,  # noqa: A002
+    shape: tuple[int, ...] | None = None,
+    fps: float | None = None,
+) -> int:
+    """Write the tracks of a video, or detections, to a file; the file appears only when it is complete.
+
+    Parameters
+    ----------
+    results
+        One :class:`FrameResult` for each frame, of which the shown tracks are written; or a `TrackTable` of
+        tracks, or of the detections of images.
+    path, format
+        File to write, and its format: ``"csv"``, ``"jsonl"`` (one JSON object per line), ``"parquet"`` (needs
+        pyarrow), ``"mot"`` (MOTChallenge text), ``"mot_zip"`` (the archive that CVAT imports as tracks),
+        ``"coco"`` (JSON) or ``"yolo"`` (a new folder). None chooses by the suffix: .csv, .jsonl, .ndjson,
+        .parquet, .txt, .zip or .json. Images have no MOT formats.
+    shape
+        ``(height, width, ...)`` of a frame, which YOLO and viewers of COCO data sets need.
+    fps
+        Frame rate, with which tables (CSV, JSON Lines, Parquet) get a last column ``time_s``: the frame's
+        number divided by it, as in `write_events`.
+
+    Returns
+    -------
+    int
+        Number of rows written.
+
+    Raises
+    ------
+    InvalidInputError
+        If the results are something else or their frames do not ascend, the format is unknown, the frame
+        rate is not a positive number, or the folder is missing or read-only.
+
+    Notes
+    -----
+    ``frame`` counts from 0, the first processed frame; boxes are half-open pixels with two decimals.
+    Unknown values are empty in CSV and null elsewhere. The score is the log-odds above the threshold, the
+    confidence a calibrated probability; speeds are relative to the camera. Detections of images have the
+    columns up to ``score``, and ``confidence``.
+
+    MOT files count frames and pixels from 1, as the MOTChallenge tools do, and hold width and height. A COCO
+    file is a data set whose image ids are the frame numbers plus 1 or depend on the file name alone; for
+    ``COCO.loadRes`` of pycocotools, use `write_labels`.
+
+    The archive for CVAT holds labels to correct, without scores: ``gt/gt.txt`` with frames from 1 and pixels
+    from 0, and ``gt/labels.txt``. A YOLO folder has ``labels/000000.txt`` for each frame, with class, center
+    and size as fractions of the frame, confidence and track.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> file = Path(tempfile.mkdtemp()) / "tracks.csv"
+    >>> write_tracks(TrackTable([0], [1], [[10, 20, 50.128, 60]], score=[1.5], distance_m=[31.4]), file)
+    1
+    >>> print(file.read_text().rstrip())
+    frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps,confidence,distance_std_m,speed_std_mps
+    0,1,10.00,20.00,50.13,60.00,1.5000,31.40,,,,
+    """
+    if not isinstance(results, TrackTable):
+        if isinstance(results, Mapping) or not is_listing(results):
+            raise InvalidInputError(
+                f"results must be a list of FrameResult or a TrackTable, got {describe(results)}"
+            )
+        with open_tracks(path, format=format, shape=shape, fps=fps) as stream:
+            for result in results:
+                stream(result)
+        return stream.rows
+    named = any(isinstance(key, str) for key in results.frame_keys)
+    kind = _check_format(path, format, _STILL_FORMATS if named else _TRACK_FORMATS)
+    columns = STILL_COLUMNS if named else TRACK_COLUMNS
+    records = [_round(record) for record in _table_records(results, columns)]
+    for record in records if named else ():
+        record["track_id"] = None if record["track_id"] == NO_TRACK else record["track_id"]
+    if fps is not None:
+        rate = check_number(fps, "fps", above=0, high=1e6)
+        columns = (*columns, TIME_COLUMN)
+        records = [_round({**record, TIME_COLUMN: record["frame"] / rate}) for record in records]
+    with _open_target(kind, _Target(Path(path), columns, shape, named, rounded=True)) as write:
+        _write_table(results, records, write)
+    return len(results)
+
+
+def write_labels(
+    labels: TrackTable,
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,  # noqa: A002
+    shape: tuple[int, ...] | None = None,
+    truth: str | os.PathLike[str] | None = None,
+) -> int:
+    """Write labelled or predicted boxes to a file without rounding; `read_labels` reads them back.
+
+    Parameters
+    ----------
+    labels
+        The boxes: predictions if they have scores, else labels.
+    path, format
+        File to write, and its format:
+
+        - ``"csv"``, ``"jsonl"``, ``"parquet"`` (needs pyarrow): the columns of `TrackTable.to_pandas`.
+        - ``"mot"``: MOTChallenge text, ground truth for labels and results for predictions.
+        - ``"coco"``: a COCO data set with all frames as images, also those without boxes.
+        - ``"coco_results"``: the list of predictions that ``COCO.loadRes`` of pycocotools takes.
+        - ``"mot_zip"``: the archive that CVAT imports as tracks.
+        - ``"kitti"``: a new folder with one ``label_2`` file for each frame.
+        - ``"yolo"``: a new folder with ``data.yaml`` and one file in ``labels`` for each frame.
+
+        None chooses by the suffix: .csv, .jsonl, .ndjson, .parquet, .txt or .zip (MOT), or .json (data set).
+    shape
+        ``(height, width, ...)`` of the images, which YOLO and some viewers of COCO data sets need. All images
+        have this shape: write those of each size separately.
+    truth
+        A COCO data set whose image ids are used; required for results. Frames are found by file name, or by
+        number in data sets written here. A data set has its images, too.
+
+    Returns
+    -------
+    int
+        Number of boxes written.
+
+    Raises
+    ------
+    InvalidInputError
+        If the format is unknown or cannot hold these boxes, or the folder is missing or read-only.
+    DatasetError
+        If `truth` is missing or not a COCO data set.
+
+    Notes
+    -----
+    No format but KITTI, YOLO (tracks of labels) and the archive for CVAT (scores) loses a box's score, track
+    or ``ignore`` without an error. What else each cannot hold:
+
+    - CSV, JSON Lines, Parquet: frames without boxes. CSV also reads names that are all whole numbers as
+      numbers, and rejects them.
+    - MOT: frames without boxes, named frames (an error), predictions marked ``ignore`` (an error), occlusion
+      and truncation (the file has an estimate of the visible fraction), distance and speed.
+    - COCO: occlusion and truncation. Ignored boxes are crowds, which pycocotools ignores as
+      `evaluate_detections` does with ``ignored_as_regions=True``.
+    - COCO results: the same, and predictions marked ``ignore`` (an error).
+    - YOLO: ignored boxes (an error), boxes that extend beyond `shape` by over 1 px (an error), suffixes of
+      file names, distance and speed. Scores become confidences.
+    - KITTI: numbered frames (an error), suffixes of images' names, tracks, distance and speed. Ignored
+      boxes become regions, and `read_labels` ignores labels that are narrow, hidden or truncated.
+
+    Without `truth`, the id of a COCO image is its frame number plus 1 or a hash of its file name: it does not
+    depend on the other frames, so that labels and predictions written separately agree.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from vehicle_detection import read_labels
+    >>> file = Path(tempfile.mkdtemp()) / "labels.txt"
+    >>> write_labels(TrackTable([0, 2], [1, 1], [[0, 0, 50, 40], [4, 0, 54, 40]]), file)
+    2
+    >>> print(file.read_text().rstrip())
+    1,1,1.0,1.0,50.0,40.0,1,3,1.0
+    3,1,5.0,1.0,50.0,40.0,1,3,1.0
+    >>> read_labels(file)["frame"]
+    array([0, 2])
+    """
+    check_type(labels, "labels", TrackTable, "collect the boxes of each frame in one")
+    kind = _check_format(path, format, _WRITERS)
+    if truth is not None and not kind.startswith("coco"):
+        raise InvalidInputError(f"truth must be None for the format {kind!r}; only COCO files have image ids")
+    _check_holds(labels, kind, shape)
+    if truth is None and kind == "coco_results":
+        raise InvalidInputError(
+            "truth must name the COCO ground truth, whose image ids the results refer to, got None; "
+            "write it with write_labels, too"
+        )
+    named = any(isinstance(key, str) for key in labels.frame_keys)
+    found = None
+    if truth is not None:
+        found = read_truth(labels, Path(truth), results=kind == "coco_results")
+    with _open_target(kind, _Target(Path(path), labels.columns, shape, named, truth=found)) as write:
+        _write_table(labels, _table_records(labels, labels.columns), write)
+    return len(labels)
+
+
+def _check_holds(labels: TrackTable, kind: str, shape: tuple[int, ...] | None) -> None:
+    """Raise if a format would change or lose what decides about the scores."""
+    names = [key for key in labels["frame"].tolist() if isinstance(key, str)]
+    padded = next((name for name in names if name != name.strip() or not name), None)
+    unnamed = [key for key in labels.frame_keys if not isinstance(key, str) or Path(key).name != key]
+    scored, ignored = "score" in labels.columns, bool(labels["ignore"].any())
+    drop = "drop them with labels[~labels['ignore']]"
+    if kind == "csv" and names and all(FRAME_NUMBER.fullmatch(name.strip()) for name in names):
+        problem = (
+            f"labels have frame names that CSV does not tell from numbers, such as {names[0]!r}; "
+            "convert them with labels.renamed(int), or write .jsonl"
+        )
+    elif kind == "csv" and padded is not None:
+        problem = f"labels name a frame {padded!r}; CSV drops the spaces around a name, so write .jsonl"
+    elif kind in ("mot", "mot_zip") and names:
+        problem = (
+            f"labels must have numbered frames for MOT, got {names[0]!r}; number them with labels.renamed"
+        )
+    elif kind in ("mot", "coco_results") and scored and ignored:
+        problem = f"labels hold predictions marked ignore, which the format {kind!r} cannot mark; {drop}"
+    elif kind == "coco_results" and not scored and len(labels):
+        problem = "labels need scores for COCO results; write labels as a data set ('coco')"
+    elif kind == "kitti" and unnamed:
+        problem = (
+            f"labels must have frames that are file names for KITTI, got {unnamed[0]!r}; "
+            "name them with labels.renamed(lambda frame: f'{frame:06d}')"
+        )
+    elif kind == "yolo" and ignored:
+        problem = f"labels hold boxes marked ignore, which YOLO cannot mark; {drop}"
+    elif kind == "yolo" and shape is not None and len(labels):
+        beyond = np.abs(labels.boxes - clip_boxes(labels.boxes, shape)).max(axis=1)
+        row = int(beyond.argmax())
+        if beyond[row] <= _ROUNDING:
+            return
+        frame = labels["frame"].tolist()[row]
+        problem = (
+            f"labels hold the box {labels.boxes[row].tolist()} in frame {frame!r}, beyond the "
+            f"{shape[1]}x{shape[0]} pixels of shape; write images of each size into a folder of their own, "
+            "and clip boxes that leave their image with clip_boxes"
+        )
+    else:
+        return
+    raise InvalidInputError(problem)
