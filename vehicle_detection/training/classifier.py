@@ -77,7 +77,9 @@ class TrainingOptions(Checked):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the options as JSON values, as a model file keeps them."""
-        return {name: value for name, value in asdict(self).items() if name != "positive_weight"}
+        values = asdict(self)
+        del values["positive_weight"]
+        return {"C": values.pop("C"), "solver": "dual", **values}
 
 
 def train_classifier(
@@ -193,7 +195,7 @@ def fit_features(
         fitted = fit_svm(features, all_labels, costs, rows=all_rows, gains=params.gains, random_state=seed)
         template, learner = Template(*fitted), "numba"
     else:
-        training |= {"estimator": " ".join(repr(estimator).split()), "C": None}
+        training |= {"estimator": " ".join(repr(estimator).split()), "C": None, "solver": None}
         rows_labels, rows_weights = all_labels[all_rows], all_weights[all_rows]
         template = _fit_estimator(estimator, features[all_rows], rows_labels, rows_weights, params.gains)
         learner = "scikit-learn"
