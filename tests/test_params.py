@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import PATCH_SIZE, FeatureParams
+from vehicle_detection.features import FeatureParams
 from vehicle_detection.function_model import FunctionParams
 from vehicle_detection.heatmap import HeatParams, heat_range
 from vehicle_detection.network import NetworkParams
@@ -69,13 +69,6 @@ def test_feature_presets_have_the_known_lengths(name, length, parts):
     assert (params.spatial_length, params.hist_length, params.hog_length) == parts
 
 
-def test_feature_presets_are_those_of_the_course():
-    luv = FeatureParams.preset("luv-2384")
-    assert (luv.color_space, luv.orient, luv.hog_channel, luv.transform_sqrt) == ("LUV", 8, 0, True)
-    assert FeatureParams.preset("ycrcb-6156") == FeatureParams()
-    assert FeatureParams.preset("ycrcb-8460") == FeatureParams(spatial_size=32)
-
-
 def test_disabled_features_have_no_length():
     params = FeatureParams(spatial_feat=False, hist_feat=False)
     assert params.length == params.hog_length == 5292
@@ -92,11 +85,6 @@ def test_coarse_hog_is_the_last_part_of_hog():
     assert (FeatureParams().coarse_blocks, FeatureParams().coarse_length) == (0, 0)
 
 
-def test_switches_of_numpy_become_bools():
-    params = FeatureParams(coarse_hog=np.bool_(True))
-    assert params.coarse_hog is True
-
-
 def test_gains_apply_to_their_parts():
     params = FeatureParams(coarse_hog=True, hist_gain=3, coarse_gain=2)
     expected = np.repeat([1.0, 3.0, 1.0, 2.0], [768, 96, 5292, 972])
@@ -108,46 +96,16 @@ def test_gains_apply_to_their_parts():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"color_space": "BGR"}, "color_space must be one of 'RGB', 'HSV', .*; got 'BGR'"),
-        ({"spatial_feat": 1}, "spatial_feat must be True or False; got 1"),
+        ({"hog_channel": 3}, "hog_channel must be one of 0, 1, 2, 'ALL', 'GRAY'"),
+        ({"spatial_size": (32, 16)}, "spatial_size must be an integer from 1 to 64"),
         ({"spatial_feat": False, "hist_feat": False, "hog_feat": False}, "all False; set one to True"),
-        ({"spatial_size": 65}, "spatial_size must be an integer from 1 to 64; got 65"),
-        ({"spatial_size": (32, 16)}, "spatial_size must be an integer"),
-        ({"spatial_order": "rows"}, "spatial_order must be one of 'channels', 'interleaved'"),
-        ({"hist_color_space": "BGR"}, "hist_color_space must be one of None, 'RGB'"),
-        ({"hist_bins": 257}, "hist_bins must be an integer from 1 to 256"),
-        ({"orient": 0}, "orient must be an integer from 1 to 180"),
-        ({"pix_per_cell": 1}, "pix_per_cell must be an integer from 2 to 64"),
         ({"pix_per_cell": 16, "cell_per_block": 5}, "cell_per_block must be an integer from 1 to 4"),
-        ({"hog_channel": 3}, "hog_channel must be one of 0, 1, 2, 'ALL', 'GRAY'; got 3"),
-        ({"hog_channel": "all"}, "hog_channel must be one of"),
-        ({"hist_sqrt": 1}, "hist_sqrt must be True or False; got 1"),
-        ({"coarse_hog": 1}, "coarse_hog must be True or False; got 1"),
-        (
-            {"coarse_hog": True, "cell_per_block": 5},
-            "coarse_hog must be False, because a block of 5 cells of 16 pixels does not fit .*; got True",
-        ),
-        ({"hist_gain": 0}, "hist_gain must be a number, at least 0.01 and at most 100; got 0"),
-        ({"coarse_gain": 101}, "coarse_gain must be a number, at least 0.01 and at most 100; got 101"),
+        ({"coarse_hog": True, "cell_per_block": 5}, "coarse_hog must be False, because a block of 5 cells"),
     ],
 )
 def test_invalid_feature_params_are_rejected(arguments, message):
     with pytest.raises(InvalidInputError, match=message):
         FeatureParams(**arguments)
-
-
-def test_numpy_numbers_become_python_numbers():
-    # Parameters from numpy.arange must be JSON serializable for the model file.
-    params = FeatureParams(
-        orient=np.int64(9),
-        hog_channel=np.int64(0),
-        spatial_size=np.int32(8),
-        hist_bins=np.uint8(4),
-        hist_gain=np.float32(2),
-    )
-    assert params == FeatureParams(orient=9, hog_channel=0, spatial_size=8, hist_bins=4, hist_gain=2)
-    plain = (int, str, bool, float, type(None))
-    assert all(type(value) in plain for value in dataclasses.asdict(params).values())
 
 
 def test_the_spatial_size_may_be_a_square_pair():
@@ -172,11 +130,8 @@ def test_an_unknown_preset_is_rejected(cls, name):
     ("arguments", "message"),
     [
         ({"window": (64, 4)}, r"window\[1\] must be a number, at least"),
-        ({"window": (64, 64, 64)}, "window must be a pair"),
         ({"y": (10, 10)}, r"y must be \(start, stop\) with start < stop; got \(10, 10\)"),
-        ({"x": (0.5, 0.2)}, r"x must be \(start, stop\) with start < stop"),
         ({"x": (0, 1280)}, r"x\[1\] must be a number, at least 0 and at most 1"),
-        ({"overlap": (1.0, 0.5)}, r"overlap\[0\] must be a number, at least 0 and at most 0.99"),
         ({"overlap": (0.5, math.nan)}, r"overlap\[1\] must be a number"),
     ],
 )
@@ -220,20 +175,9 @@ def test_a_band_scales_with_the_frame():
     )
 
 
-def test_steps_do_not_lose_a_pixel_to_rounding():
-    # 50 * (1 - 0.9) is 4.999999999999999.
-    band = SearchBand(window=(50, 50), y=(0, 100), overlap=(0.9, 0.9))
-    assert SearchParams(bands=(band,)).place((720, 1280))[0].step == (5, 5)
-
-
 def test_a_portrait_frame_scales_by_its_longer_side():
     (band,) = SEARCH.place((1280, 720))
     assert band == PixelBand(0, 640, 720, 896, (64, 64), (8, 8))
-
-
-def test_a_band_is_clipped_to_the_frame():
-    (band,) = SearchParams(bands=(SearchBand(window=(64, 64), y=(-4000, 4000)),)).place((720, 1280))
-    assert (band.y1, band.y2) == (0, 720)
 
 
 def test_bands_without_room_for_a_window_are_omitted():
@@ -299,12 +243,6 @@ def test_a_tiny_frame_is_rejected(shape, preset):
     message = f"^image of {shape[1]}x{shape[0]} pixels holds no search window .*; pass a larger image"
     with pytest.raises(InvalidInputError, match=message):
         SearchParams.preset(preset).place(shape)
-
-
-def test_windows_have_a_minimum_size():
-    for shape in [(90, 160), (120, 160), (180, 320)]:
-        for band in SearchParams.preset().place(shape):
-            assert min(band.window) >= PATCH_SIZE / 4
 
 
 def test_the_window_list_of_the_first_system():
@@ -388,11 +326,17 @@ def test_everywhere_searches_all_rows(params):
         assert {(band.y1, band.y2) for band in everywhere.place((720, 1280))} == {(0, 720)}
 
 
-def test_numbers_of_numpy_become_those_of_python():
-    params = [
+def test_values_of_numpy_become_those_of_python():
+    """Parameters from ``numpy.arange`` are written into model files as JSON."""
+    features = FeatureParams(
+        orient=np.int64(9), hog_channel=np.int64(0), hist_gain=np.float32(2), coarse_hog=np.bool_(True)
+    )
+    for params in (
+        features,
         NetworkParams(input_size=np.int64(640)),
         HeatParams(frames=np.int64(3), threshold=np.float64(2)),
-    ]
-    for each in (*params, TrackParams(confirm_hits=np.int64(3)), RegionParams(min_peak=np.float32(0.5))):
-        assert {type(value) for value in dataclasses.asdict(each).values()} & {np.int64, np.float64} == set()
-        json.dumps(dataclasses.asdict(each))
+        TrackParams(confirm_hits=np.int64(3)),
+        RegionParams(min_peak=np.float32(0.5)),
+    ):
+        plain = json.loads(json.dumps(dataclasses.asdict(params)))
+        assert type(params)(**plain) == params
