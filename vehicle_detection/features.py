@@ -132,6 +132,8 @@ class FeatureParams(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for name in ("hist_gain", "coarse_gain"):  # the same file for 1 and 1.0
+            object.__setattr__(self, name, float(getattr(self, name)))
         if not (self.spatial_feat or self.hist_feat or self.hog_feat):
             raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; set one to True")
         check_integer(self.cell_per_block, "cell_per_block", low=1, high=self.cells)

@@ -65,6 +65,8 @@ class TrainingOptions(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for name in ("C", "gamma", "degraded", "positive_weight"):  # the same file for 1 and 1.0
+            object.__setattr__(self, name, float(getattr(self, name)))
         if self.gamma and not self.mirror:
             raise InvalidInputError(
                 f"gamma must be 0 without mirrored patches, whose brightness it changes; got {self.gamma:g}"
