@@ -196,11 +196,7 @@ class VehicleClassifier:
         *,
         metadata: Mapping[str, Any] | None = None,
     ) -> VehicleClassifier:
-        """Convert fitted scikit-learn estimators: scalers and a linear classifier.
-
-        Scores equal the classifier's ``decision_function``.
-
-        Returns a model with one template.
+        """Convert fitted scikit-learn estimators, scalers and a linear classifier, to a model with equal scores.
 
         Parameters
         ----------
@@ -261,14 +257,9 @@ class VehicleClassifier:
         return BandFilters(self.params, [template.fold() for template in self.templates])
 
     def open_search(self, n_jobs: int | None = None) -> BandSearch:
-        """Open a search of frames with this model.
+        """Open a search of frames with this model: a thread-safe context manager, with `SearchParams`.
 
-        Returns a thread-safe context manager; its parameters are `SearchParams`.
-
-        Parameters
-        ----------
-        n_jobs
-            Threads; the result does not depend on them.
+        The result does not depend on the number of threads, `n_jobs`.
         """
         return BandSearch(self.filters, n_jobs)
 
