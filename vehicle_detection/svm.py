@@ -196,7 +196,7 @@ class VehicleClassifier:
         *,
         metadata: Mapping[str, Any] | None = None,
     ) -> VehicleClassifier:
-        """Convert fitted scikit-learn estimators, scalers and a linear classifier, to a model with equal scores.
+        """Convert fitted scikit-learn estimators, scalers and a linear classifier: the scores are equal.
 
         Parameters
         ----------
