@@ -40,7 +40,7 @@ frame, source, target = np.load(sys.argv[1]), sys.argv[2], sys.argv[3]
 detectors = {}
 def detector(model, jobs):
     if (model, jobs) not in detectors:
-        detectors[model, jobs] = vd.VehicleDetector(vd.load_model(model), n_jobs=jobs)
+        detectors[model, jobs] = vd.VehicleDetector(vd.load_model(model), jobs=jobs)
     return detectors[model, jobs]
 def seconds(function, *arguments, **options):
     start = time.perf_counter()

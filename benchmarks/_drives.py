@@ -25,6 +25,7 @@ from vehicle_detection import (
 from vehicle_detection.evaluation import TrackScores
 from vehicle_detection.scenes import Drive, VehicleTruth
 from vehicle_detection.tables import TrackTable
+from vehicle_detection.tracking import backfill_results, interpolate_results, search_delay, search_interval
 
 FRAMES = 200
 
@@ -120,25 +121,25 @@ def score_drive(drive: Drive, detector: VehicleDetector) -> DriveScores:
 
 def track_drive(drive: Drive, detector: VehicleDetector) -> tuple[list[FrameResult], list[int]]:
     """Results of all frames, and the frames that were searched; only these are rendered."""
-    step, fps = detector.search_interval(drive.fps), drive.fps
+    step, fps = search_interval(drive.fps), drive.fps
     detector.reset(fps=fps)
     tracked: list[FrameResult] = []
     searched = list(range(0, len(drive), step))
-    held = detector.search_delay(fps) + 1
+    held = search_delay(detector.track_params, fps, step) + 1
     for index in searched:
         found = detector.search(drive[index].image)
-        tracked.append(detector.track(found, time=index / fps))
-        tracked[-held:] = detector.backfill(tracked[-held:])
-        for _ in range(step - 1):
-            detector.skip(found.thumbnail)
+        tracked.append(detector.track(found, time=index / fps, frames=step if tracked else 1))
+        tracked[-held:] = backfill_results(tracked[-held:])
     results: list[FrameResult] = []
     for result in tracked:
         if results:
             between = range(results[-1].index + 1, result.index)
-            results += detector.interpolate(results[-1], result, [frame / fps for frame in between])
+            times = [frame / fps for frame in between]
+            results += interpolate_results(results[-1], result, times, drive.shape)
         results.append(result)
     rest = range(results[-1].index + 1, len(drive))
-    return results + detector.interpolate(results[-1], None, [frame / fps for frame in rest]), searched
+    times = [frame / fps for frame in rest]
+    return results + interpolate_results(results[-1], None, times, drive.shape), searched
 
 
 def _label_boxes(truth: Sequence[Sequence[VehicleTruth]]) -> TrackTable:

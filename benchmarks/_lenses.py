@@ -80,7 +80,7 @@ def measure(angle: float, height: float, seed: int) -> dict[str, tuple[NDArray[n
     for name, known in CAMERAS.items():
         camera = None
         if known is not None:
-            camera = Camera.for_frame(SHAPE, field_of_view=angle, height_m=height, focal_std=0.01, **known)
+            camera = Camera.for_frame(SHAPE, fov=angle, height_m=height, focal_std=0.01, **known)
         results, _ = _drives.track_drive(drive, _detector(camera))
         stated = [
             (track.distance_std_m or 0.0) > ROUGH_DISTANCE * track.distance_m

@@ -135,7 +135,7 @@ def _measure_all(python: Path, path: Path, frame: NDArray[np.uint8], threads: in
     """Milliseconds of each detector; `path` is the file of the frame."""
     found = {}
     for model in ("default", "highway"):
-        with VehicleDetector(model, n_jobs=threads) as detector:
+        with VehicleDetector(model, jobs=threads) as detector:
             seconds = median_seconds(partial(detector.detect, frame), _CALLS)
         found[f"{model}: detect"] = seconds * 1e3
     others = _measure_others(python, path, threads)

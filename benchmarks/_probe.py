@@ -90,7 +90,7 @@ def each(kind: str, folder: str, out: str) -> dict[str, Any]:
     import vehicle_detection
 
     frames = 0
-    with vehicle_detection.VehicleDetector(n_jobs=1) as detector:
+    with vehicle_detection.VehicleDetector(jobs=1) as detector:
         for path in sorted(Path(folder).iterdir()):
             target = Path(out) / path.name
             with vehicle_detection.open_tracks(target.with_suffix(".parquet")) as write:

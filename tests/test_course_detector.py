@@ -122,8 +122,10 @@ def test_it_starts_without_heat():
 
 def test_the_threshold_fits_the_density():
     sparse, dense = HeatmapDetector(), HeatmapDetector(cells_per_step=1)
-    assert dense.region_params.threshold == pytest.approx(4 * sparse.region_params.threshold)
-    assert sparse.region_params.threshold == pytest.approx(2, abs=0.2)
+    assert dense.detector.region_params.threshold == pytest.approx(
+        4 * sparse.detector.region_params.threshold
+    )
+    assert sparse.detector.region_params.threshold == pytest.approx(2, abs=0.2)
     with pytest.warns(UserWarning, match="the heat threshold 40 does not fit the density"):
         HeatmapDetector(threshold=40)
 

@@ -12,27 +12,24 @@ import pytest
 
 import vehicle_detection
 from tests.helpers import ROOT
-from tests.video.clips import write_clip
-from vehicle_detection.annotator import DrawParams, draw_tracks
+from vehicle_detection.annotator import Annotator, DrawParams
 from vehicle_detection.boxes import iou_matrix
-from vehicle_detection.camera import Camera, write_camera
+from vehicle_detection.camera import Camera, open_camera, write_camera
 from vehicle_detection.datasets import load_frames
-from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.drive import OwnSpeed
+from vehicle_detection.detector import Detector, VehicleDetector, load_model
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.evaluation import LabelledFrames, evaluate_detections
 from vehicle_detection.features import FeatureParams
 from vehicle_detection.formats import read_labels
+from vehicle_detection.function_model import detector_from
 from vehicle_detection.heatmap import HeatParams
-from vehicle_detection.loading import load_model
-from vehicle_detection.network import NetworkParams
+from vehicle_detection.images import write_image
 from vehicle_detection.regions import RegionParams
 from vehicle_detection.scenes import SceneVehicle, render_drive, render_scene
 from vehicle_detection.search import SearchBand, SearchParams
 from vehicle_detection.svm import Template, VehicleClassifier
 from vehicle_detection.tables import TrackTable
 from vehicle_detection.tracking import FrameResult, Tracker, TrackParams
-from vehicle_detection.video import process_video
 
 # Most of these frames come without times.
 pytestmark = pytest.mark.filterwarnings("ignore:the speeds assume:UserWarning")
@@ -47,7 +44,7 @@ SEARCH = SearchParams(
 # No flanks: the red squares are flat.
 FIT = RegionParams(face_width=0.78, face_height=0.78, face_offset_y=0.0, flank_length_m=0.0)
 HEAT = HeatParams(frames=3, threshold=3.0, peak_fraction=0.5)
-REGIONS = ["fitted", "heat"]
+MODES = ["fitted", "heat"]
 
 
 def red_detector():
@@ -81,7 +78,7 @@ def moved(box, x, y=0):
 
 def make(*, regions="fitted", **options):
     region_params = FIT if regions == "fitted" else HEAT
-    options = {"search_params": SEARCH, "region_params": region_params, "n_jobs": 1, **options}
+    options = {"search_params": SEARCH, "region_params": region_params, "jobs": 1, **options}
     return VehicleDetector(CLASSIFIER, **options)
 
 
@@ -120,7 +117,7 @@ def assert_same_drive(one, other):
         assert_same(a, b)
 
 
-@pytest.mark.parametrize("regions", REGIONS)
+@pytest.mark.parametrize("regions", MODES)
 def test_a_still_shows_its_vehicles(regions):
     detector = make(regions=regions)
     for boxes in ([CAR], [moved(CAR, -60, 5), OTHER]):
@@ -131,7 +128,7 @@ def test_a_still_shows_its_vehicles(regions):
     assert len(detector.detect(frame_with())) == 0
 
 
-@pytest.mark.parametrize("regions", REGIONS)
+@pytest.mark.parametrize("regions", MODES)
 def test_a_still_neither_uses_nor_changes_the_video(regions):
     frames = drive(6)
     plain, interrupted = make(regions=regions), make(regions=regions)
@@ -145,7 +142,7 @@ def test_a_still_neither_uses_nor_changes_the_video(regions):
     assert_same_drive(results, expected)
 
 
-@pytest.mark.parametrize("regions", REGIONS)
+@pytest.mark.parametrize("regions", MODES)
 def test_a_vehicle_is_followed(regions):
     detector = make(regions=regions)
     results = [detector.process(frame) for frame in drive()]
@@ -174,13 +171,13 @@ def test_a_result_tells_what_was_found():
 
 def test_what_is_too_weak_for_a_still_is_for_the_tracker_alone():
     model, road = load_model(), render_scene(shape=(360, 640), vehicles=3, random_state=5).image
-    with VehicleDetector(model, n_jobs=1) as detector:
+    with VehicleDetector(model, jobs=1) as detector:
         scores = detector.detect(road).scores
         clear = detector.process(road)
     assert (scores > 0).all()
     # The best one is now a little below a vehicle.
     strict = dataclasses.replace(model, threshold=model.threshold + scores.max() + 0.2)
-    with VehicleDetector(strict, n_jobs=1) as detector:
+    with VehicleDetector(strict, jobs=1) as detector:
         assert len(detector.detect(road)) == 0
         weak = detector.search(road).vehicles.scores
         assert weak.max() == pytest.approx(-0.2)
@@ -190,7 +187,7 @@ def test_what_is_too_weak_for_a_still_is_for_the_tracker_alone():
         assert [track.state for track in result.tracks].count("tentative") > 0
     assert len(clear.detections) == len(scores)
     blunt = TrackParams(low_threshold=0.0, high_threshold=0.0)
-    with VehicleDetector(strict, track_params=blunt, n_jobs=1) as detector:
+    with VehicleDetector(strict, track_params=blunt, jobs=1) as detector:
         assert len(detector.search(road).vehicles) == 0
         assert detector.process(road).tracks == ()
 
@@ -203,18 +200,18 @@ def test_search_in_any_order_and_follow_in_order_is_process(regions):
     expected = [straight.process(frame, time=index / 30) for index, frame in enumerate(frames)]
     order = list(range(len(frames)))
     random.Random(0).shuffle(order)
-    with make(regions=regions, n_jobs=2) as split, ThreadPoolExecutor(4) as pool:
+    with make(regions=regions, jobs=2) as split, ThreadPoolExecutor(4) as pool:
         found = dict(zip(order, pool.map(lambda index: split.search(frames[index]), order)))
         results = [split.track(found[index], time=index / 30) for index in range(len(frames))]
     assert_same_drive(results, expected)
 
 
-@pytest.mark.parametrize("regions", REGIONS)
+@pytest.mark.parametrize("regions", MODES)
 def test_threads_do_not_change_anything(regions):
     frames = drive(7)
     drives = []
-    for n_jobs in (1, 2, 3):
-        with make(regions=regions, n_jobs=n_jobs) as detector:
+    for jobs in (1, 2, 3):
+        with make(regions=regions, jobs=jobs) as detector:
             drives.append([detector.process(frame) for frame in frames])
     assert_same_drive(drives[0], drives[1])
     assert_same_drive(drives[0], drives[2])
@@ -242,9 +239,9 @@ def test_reset_takes_the_frame_rate():
 
 def test_every_second_frame_is_predicted():
     frames = drive(20)
-    every, second = make(), make(every=2)
+    every, second = make(), make()
     expected = [every.process(frame) for frame in frames]
-    results = [second.process(frame) for frame in frames]
+    results = [second.process(frame, search=index % 2 == 0) for index, frame in enumerate(frames)]
     assert [result.index for result in results] == list(range(20))
     assert [result.searched for result in results] == [True, False] * 10
     for result, other in zip(results[8:], expected[8:]):
@@ -256,130 +253,32 @@ def test_every_second_frame_is_predicted():
     assert predicted.tracks[0].state == "coasting"
     # Times are those of the frames, also where they are not given.
     assert results[18].tracks[0].age == pytest.approx(18 / 25)
-    timed = make(every=2)
-    again = [timed.process(frame, time=index / 25) for index, frame in enumerate(frames)]
+    timed = make()
+    again = [timed.process(frame, index / 25, search=index % 2 == 0) for index, frame in enumerate(frames)]
     np.testing.assert_allclose(again[18].tracks[0].box, results[18].tracks[0].box)
 
 
-def test_drawing_as_asked():
-    detector = make(draw_params=DrawParams(labels=(), line_width=1, panel="side"))
-    for frame in drive(20):
-        result = detector.process(frame)
-    assert result.shown
-    drawn = detector.annotate(frame, result)
-    assert drawn.shape == detector.annotated_shape(frame.shape)
-    assert drawn.shape[1] > frame.shape[1]
-    plain = draw_tracks(frame, result.tracks, labels=(), line_width=1)
-    np.testing.assert_array_equal(drawn[:, : frame.shape[1]], plain)
-    mosaic = make(diagnostics=True, draw_params=DrawParams(panel="side"))
-    assert mosaic.annotate(frame, mosaic.process(frame)).shape == mosaic.annotated_shape(frame.shape)
-    with pytest.raises(InvalidInputError, match="style must be a DrawParams, got 3"):
-        make(draw_params=3)
-
-
-def test_labels_state_speeds_over_ground_where_the_own_speed_is_known():
-    detector = make(own_speed=OwnSpeed([0.0, 0.5], [25.0, 25.0]))
-    detector.reset(fps=25)
-    for frame in drive(20):
-        result = detector.process(frame)
-    fast, unknown = (
-        dataclasses.replace(
-            result,
-            time=time,
-            tracks=tuple(
-                dataclasses.replace(track, speed_mps=40.0, speed_std_mps=0.5) for track in result.shown
-            ),
-        )
-        for time in (0.5, 0.6)
-    )
-    assert fast.tracks
-    relative = draw_tracks(frame, fast.tracks)
-    assert (detector.annotate(frame, fast) != relative).any()
-    np.testing.assert_array_equal(make().annotate(frame, fast), relative)
-    detector.reset(fps=25)
-    np.testing.assert_array_equal(detector.annotate(frame, unknown), relative)
-    with pytest.raises(InvalidInputError, match=r"own_speed must have a method at, got 25.0"):
-        make(own_speed=25.0)
-
-
-def test_boxes_between_searches_are_not_dashed():
-    # Without labels, whose places depend on the frames before.
-    frames, second = drive(20), make(every=2, draw_params=DrawParams(labels=()))
-    results = [second.process(frame) for frame in frames]
-    assert not results[19].searched
-    confirmed = [dataclasses.replace(track, state="confirmed") for track in results[19].tracks]
-    for frame, result in zip(frames[:-1], results):
-        second.annotate(frame, result)
-    drawn = second.annotate(frames[19], results[19])
-    np.testing.assert_array_equal(drawn, draw_tracks(frames[19], confirmed, labels=()))
-
-
 def test_a_cut_is_searched_at_once():
-    detector = make(every=5)
+    detector = make()
     for _ in range(12):
         detector.process(frame_with(CAR))
-    result = detector.process(frame_with(CAR, light=200))
+    result = detector.process(frame_with(CAR, light=200), search=False)
     assert result.searched
     assert 1 not in ids_of(result)
-    assert not detector.process(frame_with(CAR, light=200)).searched
+    assert not detector.process(frame_with(CAR, light=200), search=False).searched
 
 
 def test_a_frame_that_does_not_follow_is_searched():
-    detector = make(every=50)
-    assert detector.process(frame_with(CAR), time=1.0).searched
-    assert not detector.process(frame_with(CAR), time=1.04).searched
-    assert detector.process(frame_with(CAR), time=0.5).searched  # back in time
-    assert detector.process(frame_with(CAR), time=9.0).searched  # a gap
-    wide = frame_with(CAR, width=WIDTH + 40)
-    assert detector.process(wide, time=9.04).searched
-    assert not detector.process(wide, time=9.08).searched
-
-
-@pytest.mark.parametrize(
-    ("options", "fps", "interval"),
-    [
-        ({}, 10, 1),
-        ({}, 23.976, 2),
-        ({}, 24, 2),
-        ({}, 30, 2),
-        ({}, 60, 5),
-        ({"every": 1}, 60, 1),
-        ({"every": 3}, 10, 3),
-        ({"regions": "heat"}, 60, 1),
-        ({"diagnostics": True}, 60, 1),
-    ],
-)
-def test_the_interval_of_searches_in_a_video(options, fps, interval):
-    assert make(**options).search_interval(fps) == interval
-
-
-def test_a_video_is_interpolated_between_searches(tmp_path):
-    source = write_clip(tmp_path / "drive.mp4", drive(21))
-    runs = []
-    for workers in (1, 3):
-        results = []
-        process_video(source, None, make(every=2), workers=workers, on_result=results.append)
-        runs.append(results)
-    assert_same_drive(*runs)
-    results = runs[0]
-    assert [result.searched for result in results] == [True, False] * 10 + [True]
-    for index in range(9, 19, 2):
-        before, between, after = (results[index + step].shown[0] for step in (-1, 0, 1))
-        assert before.id == between.id == after.id == 1
-        np.testing.assert_allclose(between.box, (before.box + after.box) / 2)
-
-
-def test_frames_between_need_times():
-    detector = make()
-    before, after = (detector.process(frame_with(CAR)) for _ in range(2))
-    with pytest.raises(InvalidInputError, match="before and after must have times; pass time= to track"):
-        detector.interpolate(before, after, [0.02])
-
-
-@pytest.mark.parametrize("every", [0, -1, 1.5, "2", True])
-def test_a_bad_interval_is_refused(every):
-    with pytest.raises(InvalidInputError, match="every must be an integer from 1 to 1000"):
-        make(every=every)
+    detector, frame, wide = make(), frame_with(CAR), frame_with(CAR, width=WIDTH + 40)
+    for given, time, searched in (
+        (frame, 1.0, True),
+        (frame, 1.04, False),
+        (frame, 0.5, True),  # back in time
+        (frame, 9.0, True),  # a gap
+        (wide, 9.04, True),
+        (wide, 9.08, False),
+    ):
+        assert detector.process(given, time, search=False).searched is searched
 
 
 @pytest.mark.parametrize("regions", ["fitted", "heat"])
@@ -456,23 +355,28 @@ def test_the_camera_gives_the_distance():
     # The same picture through a lens of twice the focal length: twice as far.
     distances = []
     for factor in (1, 2):
-        camera = Camera(focal_px=280.0 * factor, horizon_px=90.0)
+        camera = Camera(focal_px=280.0 * factor, horizon_px=90.0, shape=(HEIGHT, WIDTH))
         detector = make(camera=camera)
         result = [detector.process(frame_with(CAR)) for _ in range(8)][-1]
         distances.append(result.shown[0].distance_m)
     assert distances[1] == pytest.approx(2 * distances[0], rel=0.2)
 
 
-def test_the_horizon_overrides_the_searchs():
-    assert make(horizon=0.3).search_params == dataclasses.replace(SEARCH, horizon=0.3)
-    assert make().search_params is SEARCH
-    low = make(horizon=0.9)
-    assert len(low.detect(frame_with([140, 20, 180, 60]))) == 0
+def test_the_search_and_the_camera_have_one_horizon():
+    shape, given = (720, 1280), Camera.dashcam(horizon=0.4)
+    assert Detector("highway", camera=given).search_params.horizon == 0.4
+    assert Detector("highway", camera=given).camera == given
+    # Parameters of the search that are passed are kept.
+    assert make(camera=given).detector.search_params is SEARCH
+    unknown = Detector("highway").camera
+    assert unknown.horizon == pytest.approx(SearchParams.default().horizon)
+    assert unknown.horizon_std_px / 720 == pytest.approx(0.04)
+    network = Detector(camera="wide-90").camera.for_shape(shape)
+    assert (network.focal_px, network.horizon_px) == (pytest.approx(640), 360)
 
 
 def test_half_a_vehicle_at_the_edge():
-    frame = frame_with([0, 90, 32, 130])
-    found = make().detect(frame)
+    found = make().detect(frame_with([0, 90, 32, 130]))
     assert ((found.boxes >= 0) & (found.boxes <= (WIDTH, HEIGHT, WIDTH, HEIGHT))).all()
     # Windows reach beyond the frame: what is half in the picture is found.
     assert iou_matrix(found.boxes, [[0, 90, 32, 130]]).max(initial=0) > 0.5
@@ -499,26 +403,6 @@ def test_calling_it_processes_and_annotates():
         np.testing.assert_array_equal(other(frame), one.annotate(frame, result))
 
 
-def test_diagnostics_are_another_picture_of_the_same_result():
-    plain, detailed = make(), make(diagnostics=True)
-    for frame in drive(6):
-        result, other = plain.process(frame), detailed.process(frame)
-    assert_same(result, other)
-    picture = detailed.annotate(frame, other)
-    assert picture.dtype == np.uint8
-    assert picture.ndim == 3
-    assert picture.shape != frame.shape or (picture != plain.annotate(frame, result)).any()
-
-
-def test_warming_up_leaves_no_trace():
-    warm, cold = make(), make()
-    warm.process(GOOD)
-    cold.process(GOOD)
-    warm.warm_up()
-    warm.warm_up((HEIGHT, WIDTH))
-    assert_same(warm.process(GOOD), cold.process(GOOD))
-
-
 def test_a_frame_that_cannot_be_written_is_fine():
     frame = frame_with(CAR)
     frame.setflags(write=False)
@@ -529,7 +413,7 @@ def test_a_frame_that_cannot_be_written_is_fine():
 
 
 def test_a_closed_detector_starts_again():
-    with make(n_jobs=2) as detector:
+    with make(jobs=2) as detector:
         first = detector.detect(frame_with(CAR))
     again = detector.detect(frame_with(CAR))
     detector.close()
@@ -628,14 +512,14 @@ def test_a_frame_too_small_for_a_window_is_refused():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"horizon": 1.5}, "horizon must be a number, at least 0 and at most 1"),
-        ({"horizon": 400}, "horizon must be a number, at least 0 and at most 1"),
-        ({"n_jobs": 0}, "n_jobs must be an integer from 1"),
+        ({"jobs": 0}, "jobs must be an integer from 1"),
+        ({"annotator": 3}, "annotator must be an Annotator, got 3"),
+        ({"model": Detector(CLASSIFIER), "conf": 0.5}, "conf must be omitted with a Detector"),
     ],
 )
 def test_bad_options_are_refused(options, message):
     with pytest.raises(InvalidInputError, match=message):
-        make(**options)
+        VehicleDetector(**options)
 
 
 @pytest.mark.parametrize("name", ["search_params", "region_params", "track_params", "camera"])
@@ -646,17 +530,10 @@ def test_parameters_of_another_kind_are_refused(name, value):
 
 
 def test_what_is_no_model_is_refused():
-    with pytest.raises(InvalidInputError, match="model must be a VehicleClassifier or NetworkModel, got 5"):
+    with pytest.raises(InvalidInputError, match=r"^model must be a name, a model file, .*got 5"):
         VehicleDetector(5)
     with pytest.raises(ModelFileError, match=r"model file model\.safetensors does not exist"):
         VehicleDetector("model.safetensors")
-
-
-def test_features_that_cannot_be_shared_are_rejected():
-    params = FeatureParams(color_space="RGB", spatial_size=6, hist_feat=False, hog_feat=False)
-    odd = VehicleClassifier(params, (Template(np.zeros(108), np.ones(108), np.ones(108), 0.0),))
-    with pytest.raises(InvalidInputError, match="got spatial_size=6; use search_windows"):
-        VehicleDetector(odd, search_params=SEARCH)
 
 
 def test_the_default_is_the_shipped_model():
@@ -670,21 +547,21 @@ def test_the_default_is_the_shipped_model():
 @pytest.mark.parametrize("shape", [(540, 960), (375, 1242), (360, 480)])
 def test_the_default_takes_frames_of_other_cameras(shape):
     noise = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
-    found = VehicleDetector(horizon=0.45).detect(noise)
+    found = VehicleDetector().detect(noise)
     height, width = shape
     assert ((found.boxes >= 0) & (found.boxes <= (width, height, width, height))).all()
 
 
 def test_heat_thresholds_depend_on_the_model():
     thresholds = {
-        model: VehicleDetector(model, region_params=HeatParams()).region_params.threshold
+        model: Detector(model, region_params=HeatParams()).heat_params.threshold
         for model in ("default", "highway")
     }
     assert thresholds == {"default": 0.0, "highway": 2.0}
-    assert make(region_params=HeatParams(threshold=7.0)).region_params.threshold == 7
+    assert make(region_params=HeatParams(threshold=7.0)).detector.heat_params.threshold == 7
     with pytest.warns(UserWarning, match="the heat threshold 50 does not fit the density") as caught:
         VehicleDetector("highway", region_params=HeatParams(threshold=50.0))
-    assert caught[0].filename == __file__
+    assert len(caught) == 1
 
 
 @pytest.mark.realdata
@@ -759,83 +636,38 @@ def wide_scenes():
 
 
 def test_a_known_lens_gives_the_distance(wide_scenes, tmp_path):
-    tracks, detector = track_cars(wide_scenes, field_of_view=90, camera_height_m=1.5, horizon=0.56)
-    assert detector.lens_is_known
+    tracks, detector = track_cars(wide_scenes, camera=Camera.dashcam(fov=90, height_m=1.5, horizon=0.56))
+    assert detector.camera.lens_is_known
     assert median_distance(tracks) == pytest.approx(9.0, rel=0.1)
     assert all(track.distance_std_m < 0.2 * track.distance_m for track in tracks)
     write_camera(wide_scenes[0].camera, tmp_path / "camera.json", (720, 1280))
     tracks, detector = track_cars(wide_scenes, camera=tmp_path / "camera.json")
-    assert detector.lens_is_known
+    assert detector.camera.lens_is_known
     assert median_distance(tracks) == pytest.approx(9.0, rel=0.1)
-    tracks, _ = track_cars(wide_scenes, camera="wide-90", camera_height_m=1.5)
+    tracks, _ = track_cars(wide_scenes, camera=open_camera("wide-90", height_m=1.5))
     assert median_distance(tracks) == pytest.approx(9.0, rel=0.2)
 
 
 def test_an_unknown_lens_gives_a_large_error(wide_scenes):
     ((track,), detector) = track_cars(wide_scenes[:1])
-    assert not detector.lens_is_known
+    assert not detector.camera.lens_is_known
     assert track.distance_m > 1.3 * 9.0
     assert track.distance_std_m >= 0.25 * track.distance_m
 
 
 def test_the_search_takes_the_horizon_of_a_camera_file(tmp_path):
-    shape = (720, 1280)
-    default = NetworkParams()
-    camera = Camera.for_frame(shape, horizon=0.4)
-    write_camera(camera, tmp_path / "camera.json", shape)
-    (tmp_path / "lens.json").write_text('{"field_of_view": 90}')
-    file = {"camera": tmp_path / "camera.json"}
-    for size in (shape, (360, 640)):
-        found = VehicleDetector(**file).search_params_of(size)
-        assert found == dataclasses.replace(default, horizon=0.4)
-    given = VehicleDetector(**file, horizon=0.6).search_params_of(shape)
-    assert given == default.with_horizon(0.6)
-    assert VehicleDetector(**file, search_params=default).search_params_of(shape) == default
-    for other in (None, camera, tmp_path / "lens.json", "wide-90"):
-        assert VehicleDetector(camera=other).search_params_of(shape) == default
-    bands = VehicleDetector("highway", **file).search_params_of(shape)
-    assert bands == SearchParams.default().with_horizon(0.4)
+    camera = Camera.for_frame((720, 1280), horizon=0.4)
+    write_camera(camera, tmp_path / "camera.json")
+    (tmp_path / "lens.json").write_text('{"fov": 90}')
+    assert Detector("highway", camera=tmp_path / "camera.json").search_params.horizon == 0.4
+    for other in (None, tmp_path / "lens.json", "wide-90"):
+        assert Detector("highway", camera=other).search_params == SearchParams.default()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"field_of_view": 200}, "field_of_view must be a number, at least 1 and at most 170; got 200"),
-        ({"camera_height_m": 0}, "camera_height_m must be a number, greater than 0"),
-        ({"camera": "wide-90", "field_of_view": 90}, "field_of_view must be omitted with a camera"),
-        (
-            {"camera": Camera.for_frame((72, 128)), "camera_height_m": 1},
-            "camera_height_m must be omitted with a",
-        ),
-        ({"camera": 7}, "camera must be a Camera or str or PathLike, got 7"),
-    ],
-)
-def test_invalid_camera_options(options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        VehicleDetector(**options)
-
-
-def test_a_given_horizon_is_that_of_the_camera_too(tmp_path):
-    shape = (720, 1280)
-    camera = Camera.for_frame(shape, horizon=0.4)
-    write_camera(camera, tmp_path / "camera.json", shape)
-    found = [
-        VehicleDetector(camera=each, horizon=0.6).camera_of(shape)
-        for each in (camera, tmp_path / "camera.json")
-    ]
-    assert found[0] == found[1]
-    assert found[0].horizon_px == pytest.approx(432)
-    assert VehicleDetector(camera=camera).camera_of(shape) is camera
-
-
-def test_a_camera_of_another_size_is_scaled_or_refused():
-    camera = Camera.for_frame((720, 1280), field_of_view=60)
-    detector = VehicleDetector(camera=camera)
-    assert detector.camera_of((360, 640)) == camera.for_shape((360, 640))
-    assert VehicleDetector(camera=camera, horizon=0.5).camera_of((360, 640)).horizon_px == 180
-    image = np.zeros((480, 640, 3), np.uint8)
+def test_a_camera_of_another_aspect_ratio_is_refused():
+    detector = VehicleDetector(camera=Camera.for_frame((720, 1280), fov=60))
     with pytest.raises(InvalidInputError, match=r"frames of 640x480 pixels .* got one for 1280x720"):
-        detector.process(image)
+        detector.process(np.zeros((480, 640, 3), np.uint8))
 
 
 def test_times_become_floats():
@@ -848,7 +680,7 @@ def test_a_shallow_copy_shares_the_search_and_has_its_own_tracks():
         detector.process(frame)
     other = copy.copy(detector)
     assert other.model is detector.model
-    assert other._search is detector._search
+    assert other.detector is detector.detector
     other.process(np.zeros_like(frames[6]))  # a cut
     assert detector.process(frames[6]).tracks
     assert not other.process(np.zeros_like(frames[6])).tracks
@@ -866,7 +698,7 @@ def test_short_descriptions():
 
 def test_a_second_thread_is_refused():
     detector, frames = make(), drive()
-    with detector._one_thread(), ThreadPoolExecutor(1) as pool:
+    with detector._one_thread, ThreadPoolExecutor(1) as pool:
         detector.process(frames[0])  # the same thread may go on
         for call in (detector.process, lambda frame: detector.track(detector.search(frame))):
             with pytest.raises(InvalidInputError, match="frames must be processed one after the other"):
@@ -875,6 +707,114 @@ def test_a_second_thread_is_refused():
     assert detector.process(frames[1]).index == 1
 
 
-def test_every_frame_is_searched_where_vehicles_are_blurred():
-    assert VehicleDetector(blur="plates").search_interval(30) == 1
-    assert VehicleDetector(blur="plates", every=2).search_interval(30) == 2
+def test_parts_can_be_passed_in():
+    annotator = Annotator(DrawParams(labels=()))
+    with Detector(CLASSIFIER, search_params=SEARCH, region_params=FIT) as part:
+        detector = VehicleDetector(part, annotator=annotator)
+        for frame in drive(8):
+            result = detector.process(frame)
+        assert detector.detector is part
+        assert result.shown
+        np.testing.assert_array_equal(
+            detector.annotate(frame, result), Annotator(DrawParams(labels=())).draw(frame, result)
+        )
+
+
+def test_several_images_are_detected_one_by_one(tmp_path):
+    detector, other = make(), frame_with(OTHER)
+    write_image(tmp_path / "other.png", other)
+    first, second = detector.detect([GOOD, str(tmp_path / "other.png")])
+    np.testing.assert_array_equal(first.boxes, detector.detect(GOOD).boxes)
+    np.testing.assert_array_equal(second.boxes, detector.detect(other).boxes)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    cars = [
+        SceneVehicle(distance_m=distance, lateral_m=lateral) for distance, lateral in ((14, 0), (30, 3.6))
+    ]
+    return render_scene(shape=(360, 640), vehicles=cars, lane=1, random_state=3)
+
+
+def test_the_threshold_of_the_default_model_has_its_probability():
+    model = load_model()
+    at_threshold = 1 / (1 + np.exp(-model.threshold))
+    assert model.calibration.probability(0.0) == pytest.approx(at_threshold)
+    assert model.with_confidence(0.5).threshold == 0.0
+
+
+@pytest.mark.parametrize("name", ["default", "highway"])
+def test_boxes_have_at_least_the_confidence(scene, name):
+    with VehicleDetector(name) as detector:
+        everything = detector.detect(scene.image)
+    found = {}
+    for conf in (0.1, 0.5, 0.9):
+        with VehicleDetector(name, conf=conf) as detector:
+            found[conf] = detector.detect(scene.image)
+        assert (found[conf].confidences >= conf - 1e-6).all()
+    assert len(found[0.1]) >= len(found[0.5]) >= len(found[0.9])
+    assert len(found[0.5]) >= 1
+    # The threshold does not change the probability of a box.
+    best = max(everything.confidences)
+    assert max(found[0.1].confidences) == pytest.approx(best, abs=1e-6)
+
+
+def test_tracks_have_a_confidence(scene):
+    with VehicleDetector(conf=0.6) as detector:
+        detector.reset(fps=10)
+        for _ in range(8):
+            result = detector.process(scene.image)
+    assert result.shown
+    for track in result.shown:
+        # The frames are alike, so the mean score is that of each detection.
+        expected = detector_probability(detector, result.detections.scores)
+        assert np.isclose(expected, track.confidence).any()
+        assert track.confidence >= 0.6
+    assert result.detections.confidences.min() >= 0.6
+
+
+def detector_probability(detector, score):
+    return 1 / (1 + np.exp(-(score + detector.model.threshold)))
+
+
+def test_confidence_of_a_function():
+    found = np.array([[10.0, 10, 50, 40], [100, 10, 150, 40]]), np.array([0.4, 0.8])
+    image = np.zeros((90, 160, 3), np.uint8)
+    for options, given in (({}, found), ({"score": "logit"}, (found[0], np.log([2 / 3, 4.0])))):
+        for threshold in ({}, {"threshold": 0.3}):
+            detector = detector_from(lambda _, given=given: given, **options, **threshold)
+            np.testing.assert_allclose(detector.detect(image).confidences[-1], 0.8, atol=1e-9)
+            assert len(detector_from(lambda _, given=given: given, conf=0.5, **options).detect(image)) == 1
+            assert len(detector_from(lambda _, given=given: given, conf=0.2, **options).detect(image)) == 2
+
+
+def test_weak_groups_of_windows_need_less_evidence():
+    strict = Detector("highway", conf=0.99).region_params
+    loose = Detector("highway", conf=0.05, region_params=RegionParams(min_iou=0.4)).region_params
+    assert strict.min_peak > RegionParams().min_peak > loose.min_peak
+    assert strict.min_evidence == RegionParams().min_evidence > loose.min_evidence
+    assert loose == dataclasses.replace(loose, min_iou=0.4)
+
+
+def test_a_heat_map_has_no_confidence(scene):
+    with VehicleDetector("highway", region_params=HeatParams()) as detector:
+        assert detector.detect(scene.image).confidences is None
+        assert all(track.confidence is None for track in detector.process(scene.image).tracks)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"conf": 1.5}, "conf must be a number, at least 0 and at most 1; got 1.5"),
+        ({"conf": "high"}, "conf must be a number"),
+        ({"conf": 0.5, "region_params": HeatParams()}, "conf must be None with a heat map.*HeatParams"),
+    ],
+)
+def test_invalid_confidence(options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        VehicleDetector(**options)
+
+
+def test_scores_of_their_own_scale_have_no_confidence():
+    with pytest.raises(InvalidInputError, match="conf must be None for scores on a scale"):
+        detector_from(lambda image: ([], []), score=(0, 10), conf=0.5)

@@ -12,10 +12,10 @@ from sklearn.svm import LinearSVC
 
 from tests.video.clips import write_clip
 from vehicle_detection.boxes import Detections
-from vehicle_detection.detector import VehicleDetector, detector_from
+from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.evaluation import evaluate_tracks
-from vehicle_detection.function_model import FunctionModel, FunctionParams
+from vehicle_detection.function_model import FunctionModel, FunctionParams, detector_from
 from vehicle_detection.heatmap import HeatParams
 from vehicle_detection.notebook import Explorer
 from vehicle_detection.tables import TrackTable
@@ -243,10 +243,9 @@ def test_calls_wait_for_each_other_unless_the_function_is_thread_safe(thread_saf
 def test_a_function_has_the_interface_of_a_model():
     model = FunctionModel(function=find_red, score=(0, 8))
     assert model.summary() == ("function find_red", {"scores": "0 to 8", "threshold": "default"})
-    detector = VehicleDetector(model, horizon=0.5)
-    assert detector.search_params == FunctionParams(horizon=0.5, horizon_tolerance=0.06)
-    detector.warm_up()
-    detector.close()
+    with VehicleDetector(model) as detector:
+        assert detector.detector.search_params == FunctionParams()
+        assert detector.detector.searches_every_frame
     heat = detector_from(find_red, region_params=HeatParams(weighting="count", peak_fraction=0))
     assert heat.detect(frame_with(BOX)).boxes.tolist() == [BOX]
     explorer = Explorer([frame_with(BOX)], FunctionModel(function=find_red))

@@ -163,7 +163,7 @@ def test_importing_the_package_is_light():
 
 
 def test_the_detector_imports_no_plotting_and_no_training():
-    loaded = modules_after("import vehicle_detection as v; v.VehicleDetector(n_jobs=1)")
+    loaded = modules_after("import vehicle_detection as v; v.VehicleDetector(jobs=1)")
     assert not loaded & (HEAVY | {"skimage"})
 
 

@@ -130,7 +130,6 @@ INTERNAL = {
     "HeatParams.for_search", "NetworkModel.feeds",
     "NetworkModel.input_size_for", "NetworkModel.probability", "NetworkModel.scores",
     "SearchBand.place", "SearchParams.place",
-    "VehicleDetector.interpolate", "VehicleDetector.skip",
 }  # fmt: skip
 """Methods that only the library calls, with its own results."""
 
@@ -203,7 +202,7 @@ class _Valid:
         camera = vd.Camera(focal_px=500.0, horizon_px=40.0)
         band = vd.SearchBand(window=(64, 64), y=(0.0, 256.0))
         search = vd.SearchParams(bands=(band,))
-        detector = vd.VehicleDetector(classifier, n_jobs=1)
+        detector = vd.VehicleDetector(classifier, jobs=1)
         result = detector.process(image)
         tracker, log, own_speed = vd.Tracker(), vd.TrackTable(), vd.OwnSpeed.constant(25.0)
         report = vd.VideoReport(

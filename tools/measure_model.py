@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_target, write_text
+from vehicle_detection.detector import load_model
 from vehicle_detection.errors import DatasetError, VehicleDetectionError
-from vehicle_detection.loading import load_model
 from vehicle_detection.training import (
     FoldDetections,
     FrameDataset,

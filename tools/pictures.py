@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
 import vehicle_detection
-from vehicle_detection import DetectorError, FrameResult, VehicleDetectionError, VehicleDetector, iou_matrix
+from vehicle_detection import (
+    DetectorError,
+    FrameResult,
+    VehicleDetectionError,
+    VehicleDetector,
+    iou_matrix,
+)
 from vehicle_detection._common import atomic_write, progress_bar, write_text
 from vehicle_detection.annotator import Annotator, DrawParams
 from vehicle_detection.camera import Camera
@@ -161,7 +167,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("-o", "--output", metavar="DIR", type=Path, default=Path("docs"), help="folder")
     folder = parser.parse_args(arguments).output
     try:
-        with VehicleDetector(field_of_view=58) as detector:
+        with VehicleDetector(camera=Camera.dashcam(fov=58)) as detector:
             make_pictures(folder, detector)
     except VehicleDetectionError as error:
         parser.error(str(error))

@@ -30,7 +30,7 @@ def make_picture(path: Path, *, n_jobs: int | None = None) -> None:
     images = {name: rendered[key] for name, key in SCENES.items()}
     found = {}
     for model in "highway", "default":
-        with VehicleDetector(model, n_jobs=n_jobs) as detector:
+        with VehicleDetector(model, jobs=n_jobs) as detector:
             found[model] = [detector.detect(image) for image in images.values()]
     truth = [scenes.labels.frame(key) for key in SCENES.values()]
     figure = Figure(figsize=(10, 9), layout="constrained")

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from tools.browser import Browser
 from tools.pictures import MODEL, file_hash, find_errors
-from vehicle_detection import DetectorError, Explorer, VehicleDetectionError, VehicleDetector
+from vehicle_detection import Camera, DetectorError, Explorer, VehicleDetectionError, VehicleDetector
 from vehicle_detection._common import atomic_write, write_text
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.drive import ReportWriter, find_events
@@ -95,7 +95,7 @@ def _write_report(folder: Path, detector: VehicleDetector) -> Path:
 
     done = process_video(clip, annotated, detector, on_result=add)
     _check(boxes, drive.truth_of(REPORT_FRAME))
-    camera = detector.camera_of(done.shape)
+    camera = detector.camera.for_shape(done.shape)
     write.finish(done, events=find_events(write.table, fps=drive.fps, shape=done.shape, camera=camera))
     return page
 
@@ -131,7 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     folder = parser.parse_args(arguments).output
     try:
-        with VehicleDetector(field_of_view=58) as detector:
+        with VehicleDetector(camera=Camera.dashcam(fov=58)) as detector:
             make_screenshots(folder, detector)
     except (VehicleDetectionError, FileNotFoundError) as error:
         parser.error(str(error))

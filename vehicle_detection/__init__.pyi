@@ -1,12 +1,7 @@
 from . import course, notebook
-from .annotator import (
-    Annotator,
-    DrawParams,
-    draw_diagnostics,
-    draw_tracks,
-)
+from .annotator import Annotator, DrawParams, draw_diagnostics, draw_tracks
 from .boxes import Detections, Platt, clip_boxes, iou_matrix, non_max_suppression
-from .camera import Camera, HorizonEstimate, estimate_horizon, read_camera, write_camera
+from .camera import Camera, open_camera, read_camera, write_camera
 from .course import HeatmapDetector
 from .datasets import (
     FrameSet,
@@ -23,13 +18,8 @@ from .datasets import (
     split_sequences,
     split_sources,
 )
-from .detector import VehicleDetector, detector_from
-from .drawing import (
-    blur_boxes,
-    draw_boxes,
-    draw_detections,
-    draw_labeled_bboxes,
-)
+from .detector import Detector, VehicleDetector, load_model
+from .drawing import blur_boxes, draw_boxes, draw_detections, draw_labeled_bboxes
 from .drive import (
     BatchReport,
     BatchStatus,
@@ -63,15 +53,16 @@ from .errors import (
 )
 from .evaluation import (
     DetectionScores,
+    Explanation,
     LabelledFrames,
     TrackScores,
     calibrate_scores,
     calibration_error,
     evaluate_detections,
     evaluate_tracks,
+    explain,
     precision_recall_curve,
 )
-from .explanation import Explanation, explain
 from .features import (
     FeatureParams,
     bin_spatial,
@@ -83,10 +74,9 @@ from .features import (
     single_img_features,
 )
 from .formats import open_tracks, read_labels, write_labels, write_tracks
-from .function_model import FunctionParams
+from .function_model import FunctionParams, detector_from
 from .heatmap import HeatHistory, HeatParams, add_heat, apply_threshold, bounding_boxes, label_boxes
 from .images import read_image, write_image
-from .loading import load_model
 from .network import NetworkModel, NetworkParams
 from .notebook import Explorer
 from .regions import RegionParams, find_vehicles
@@ -94,7 +84,7 @@ from .scenes import render_drive, render_patches, render_scene
 from .search import SearchBand, SearchParams, SearchResult
 from .svm import VehicleClassifier, load_classifier
 from .tables import TrackTable
-from .tracking import FrameResult, Track, Tracker, TrackParams
+from .tracking import FrameResult, HorizonEstimate, SceneCuts, Track, Tracker, TrackParams, estimate_horizon
 from .training import (
     FrameDataset,
     PatchFeatures,
@@ -115,6 +105,7 @@ from .video import (
     TrackRun,
     VideoInfo,
     VideoReport,
+    annotate_clip,
     open_source,
     probe_video,
     process_video,
@@ -133,6 +124,7 @@ __all__ = [
     "DatasetError",
     "DetectionScores",
     "Detections",
+    "Detector",
     "DetectorError",
     "DrawParams",
     "Event",
@@ -160,6 +152,7 @@ __all__ = [
     "Platt",
     "RegionParams",
     "ReportWriter",
+    "SceneCuts",
     "SearchBand",
     "SearchParams",
     "SearchResult",
@@ -183,6 +176,7 @@ __all__ = [
     "VideoInfo",
     "VideoReport",
     "add_heat",
+    "annotate_clip",
     "apply_threshold",
     "batch_status",
     "batch_summary",
@@ -228,6 +222,7 @@ __all__ = [
     "mine_negatives",
     "non_max_suppression",
     "notebook",
+    "open_camera",
     "open_dask",
     "open_source",
     "open_tracks",

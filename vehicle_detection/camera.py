@@ -1,10 +1,12 @@
-"""Camera over a flat road: lens, parameters and their uncertainty, its file, and an estimate of its horizon.
+"""Camera over a flat road: its lens, height and horizon, with their uncertainty, and its file.
 
 The geometry is the pinhole camera (Hartley and Zisserman, *Multiple View Geometry*, chapter 6) over a flat
 road, as in Stein, Mano and Shashua, *Vision-based ACC with a single camera* (IV 2003): a road point seen `d`
 pixels below the horizon lies ``focal * height / d`` ahead, and a vehicle of known width seen `w` pixels wide
 lies ``focal * width / w`` ahead. Boxes from a fisheye lens are first converted to those of a pinhole camera
 with the model of OpenCV's ``cv2.fisheye`` (Kannala and Brandt, PAMI 2006).
+
+`Camera` is what is known before a video; `tracking.horizon` refines its horizon from the vehicles.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import dataclasses
 import json
 import math
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +23,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
+    Checked,
     Floats,
     Limit,
     check_array,
-    check_bool,
     check_boxes,
     check_choice,
     check_integer,
@@ -32,7 +34,10 @@ from vehicle_detection._common import (
     check_path,
     check_shape,
     check_type,
+    checked_field,
     describe,
+    flag,
+    number,
     read_regular_file,
     write_text,
 )
@@ -42,30 +47,20 @@ from vehicle_detection.errors import InvalidInputError
 FrameShape = tuple[int, int]
 """Height and width of a frame in pixels."""
 
-# Focal length in pixels of the reference camera, a 1280x720 dash-cam, for which pixel errors are given.
-_REFERENCE_FOCAL_PX = 0.9 * 1280
-# The following constants are those of `estimate_horizon`. Number of boxes required.
-_MIN_BOXES = 4
-# Prior of the camera's height (m), and its standard deviation.
-_CAMERA_HEIGHT, _CAMERA_HEIGHT_STD = 1.35, 0.3
-# Prior standard deviation of the horizon around the middle row, as a fraction of the frame's height.
-_HORIZON_STD = 0.15
-# Standard error of a bottom edge in pixels of a frame 1280 wide.
-_EDGE_STD_PX = 3.5
-# Standard deviation of vehicles' heights, as a fraction.
-_RELATIVE_STD = 0.12
-# Boxes with a larger residual, in standard errors, are ignored.
-_BIWEIGHT = 4.7
-# Number of boxes that count as one, because they show the same vehicle.
-_CORRELATED_BOXES = 3.0
-# 80th percentile of the absolute values of a normal distribution.
-_NORMAL_80 = 1.282
+# Frame to which the numbers of a camera without a shape refer, and focal length in pixels (0.9 times the
+# width) for which pixel errors are given.
+_REFERENCE_SHAPE, _REFERENCE_FOCAL_PX = (720, 1280), 0.9 * 1280
+# Relative standard error of the focal length of a typical lens, of a given field of view, and of a guess.
+_LENS_STD, _GIVEN_LENS_STD, _UNKNOWN_LENS_STD = 0.08, 0.03, 0.25
+# Standard error of a given height of the camera (m).
+_GIVEN_HEIGHT_STD = 0.05
+# Horizon of an unknown camera, its standard error, that of a given horizon, and the largest one of a horizon
+# that counts as known; fractions of the frame's height.
+_HORIZON, _HORIZON_STD, _GIVEN_HORIZON_STD, _KNOWN_HORIZON_STD = 0.5, 0.06, 0.012, 0.02
 # Largest angle from the optical axis (radians) at which boxes are converted to a pinhole camera.
 _MAX_ANGLE = math.radians(80)
 
 _PIXEL_FIELDS = ("focal_px", "horizon_px", "horizon_std_px")  # in pixels of the frame
-# Size of frames for which a file is checked that states none.
-_ANY_SHAPE = (720, 1280)
 
 LENSES: dict[str, tuple[float, bool]] = {
     "standard-58": (58.0, False),
@@ -79,12 +74,9 @@ LENSES: dict[str, tuple[float, bool]] = {
 Their errors are those of a guess; a calibrated camera (`read_camera`) is better.
 """
 
-LENS_STD, GIVEN_LENS_STD, UNKNOWN_LENS_STD = 0.08, 0.03, 0.25
-"""Relative standard error of the focal length of a typical lens, of a given field of view, and of a guess."""
-
 
 @dataclass(frozen=True, kw_only=True)
-class Camera:
+class Camera(Checked):
     """A forward-looking camera over a flat road, with the uncertainty of its parameters.
 
     Attributes
@@ -115,9 +107,9 @@ class Camera:
         which is that of the frame's middle, meets the frame at
         ``focal_px * a * (1 + k1 * a**2 + k2 * a**4)`` pixels from the middle.
     shape
-        Height and width of the frames that the pixels refer to, which `for_frame` and `read_camera` set; None
-        if unknown. For frames of another size, `for_shape` scales the pixels; a copy with other pixels by
-        ``dataclasses.replace`` needs another `shape`, too. It is not compared.
+        Height and width of the frames that the pixels refer to; the camera then fits frames of this aspect
+        ratio. None: it fits all frames, and the pixels are those of a frame of 1280x720. `for_shape` scales
+        them; a copy with other pixels by ``dataclasses.replace`` needs another `shape`, too.
 
     Examples
     --------
@@ -126,39 +118,24 @@ class Camera:
     (1155, 360.0)
     """
 
-    focal_px: float
-    horizon_px: float
-    horizon_std_px: float = 0.0
-    height_m: float = 1.3
-    vehicle_width_m: float = 1.8
-    vehicle_width_std_m: float = 0.25
-    vehicle_height_m: float = 1.5
-    vehicle_length_m: float = 4.5
-    vehicle_length_std_m: float = 0.8
-    bottom_std_px: float = 2.5
-    pitch_std_px: float = 3.0
-    box_std: float = 0.04
-    focal_std: float = LENS_STD
-    height_std_m: float = 0.1
-    fisheye: bool = False
-    k1: float = 0.0
-    k2: float = 0.0
-    shape: FrameShape | None = field(default=None, compare=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "fisheye", check_bool(self.fisheye, "fisheye"))
-        if self.shape is not None:
-            object.__setattr__(self, "shape", check_shape(self.shape))
-        for name in self.__dataclass_fields__.keys() - {"fisheye", "shape"}:
-            low, high, above = 0.0, 1e6, -math.inf
-            if name in ("k1", "k2"):
-                low, high = -1, 1
-            elif name in ("focal_px", "height_m", "vehicle_width_m", "vehicle_height_m"):
-                low, above = -math.inf, 0
-            elif name == "horizon_px":
-                low = -1e6
-            number = check_number(getattr(self, name), name, low=low, high=high, above=above)
-            object.__setattr__(self, name, number)
+    focal_px: float = number(above=0, high=1e6)
+    horizon_px: float = number(low=-1e6, high=1e6)
+    horizon_std_px: float = number(0.0, low=0, high=1e6)
+    height_m: float = number(1.3, above=0, high=1e6)
+    vehicle_width_m: float = number(1.8, above=0, high=1e6)
+    vehicle_width_std_m: float = number(0.25, low=0, high=1e6)
+    vehicle_height_m: float = number(1.5, above=0, high=1e6)
+    vehicle_length_m: float = number(4.5, low=0, high=1e6)
+    vehicle_length_std_m: float = number(0.8, low=0, high=1e6)
+    bottom_std_px: float = number(2.5, low=0, high=1e6)
+    pitch_std_px: float = number(3.0, low=0, high=1e6)
+    box_std: float = number(0.04, low=0, high=1e6)
+    focal_std: float = number(_LENS_STD, low=0, high=1e6)
+    height_std_m: float = number(0.1, low=0, high=1e6)
+    fisheye: bool = flag(False)
+    k1: float = number(0.0, low=-1, high=1)
+    k2: float = number(0.0, low=-1, high=1)
+    shape: FrameShape | None = checked_field(None, lambda value, _: check_shape(value))  # noqa: RUF009
 
     @classmethod
     def for_frame(
@@ -166,7 +143,7 @@ class Camera:
         shape: tuple[int, ...],
         *,
         horizon: float = 0.56,
-        field_of_view: float = 58.0,
+        fov: float = 58.0,
         height_m: float = 1.3,
         lens: str | None = None,
         **known: Any,
@@ -180,10 +157,10 @@ class Camera:
         horizon
             Row of the horizon as a fraction of the height, 0 at the top; a guess if ``horizon_std_px`` is
             passed too.
-        field_of_view
+        fov
             Angle of view along the frame's longer side in degrees.
         lens
-            Name of a typical lens, which replaces `field_of_view`: ``"standard-58"`` or ``"wide-90"``
+            Name of a typical lens, which replaces `fov`: ``"standard-58"`` or ``"wide-90"``
             (pinhole), ``"fisheye-120"``, ``"fisheye-140"`` or ``"fisheye-170"`` (``focal_px * angle``).
         **known
             Other attributes of the class, such as ``focal_std=0.01`` for a calibrated lens.
@@ -203,10 +180,10 @@ class Camera:
         horizon = check_number(horizon, "horizon", low=-10, high=10)
         if lens is not None:
             check_choice(lens, "lens", LENSES)
-            field_of_view, fisheye = LENSES[lens]
+            fov, fisheye = LENSES[lens]
             known = {"fisheye": fisheye} | known
-        angle = check_number(field_of_view, "field_of_view", low=1, high=170)
-        derived = {"focal_px": "field_of_view", "horizon_px": "horizon"}
+        angle = check_number(fov, "fov", low=1, high=170)
+        derived = {"focal_px": "fov", "horizon_px": "horizon"}
         unknown = sorted(known.keys() - cls.__dataclass_fields__.keys() | known.keys() & derived.keys())
         if unknown:
             raise InvalidInputError(
@@ -224,6 +201,55 @@ class Camera:
         size = height, width
         return cls(focal_px=focal, horizon_px=horizon * height, height_m=height_m, shape=size, **known)
 
+    @classmethod
+    def dashcam(
+        cls,
+        *,
+        fov: float | None = None,
+        height_m: float | None = None,
+        horizon: float | None = None,
+        lens: str | None = None,
+    ) -> Camera:
+        """Return a dash-cam for frames of any size; what is not given is a guess with a large standard error.
+
+        Parameters
+        ----------
+        fov, lens
+            Angle of view along the frame's longer side in degrees, of a lens without distortion; or the name
+            of a typical lens, as in `for_frame`. If both are unknown, 58 degrees with an error of 25%.
+        height_m
+            Height of the lens above the road in meters; by default 1.3.
+        horizon
+            Row of the horizon as a fraction of the height, 0 at the top; by default in the middle, and
+            estimated by the tracker.
+
+        Examples
+        --------
+        >>> camera = Camera.dashcam(fov=90)
+        >>> round(camera.for_shape((480, 640)).focal_px), camera.lens_is_known, camera.horizon_is_known
+        (320, True, False)
+        """
+        known: dict[str, Any] = {"focal_std": _UNKNOWN_LENS_STD}
+        if lens is not None:
+            known = {"lens": lens}
+        elif fov is not None:
+            known = {"fov": fov, "focal_std": _GIVEN_LENS_STD}
+        if height_m is not None:
+            height = check_number(height_m, "height_m", above=0, high=100)
+            known |= {"height_m": height, "height_std_m": _GIVEN_HEIGHT_STD}
+        camera = dataclasses.replace(cls.for_frame(_REFERENCE_SHAPE, **known), shape=None)
+        return (
+            camera.with_horizon(horizon)
+            if horizon is not None
+            else camera.with_horizon(_HORIZON, _HORIZON_STD)
+        )
+
+    def with_horizon(self, horizon: float, std: float = _GIVEN_HORIZON_STD) -> Camera:
+        """Return the camera with another horizon and standard error, as fractions of the frame's height."""
+        height = (self.shape or _REFERENCE_SHAPE)[0]
+        row = check_number(horizon, "horizon", low=0, high=1) * height
+        return dataclasses.replace(self, horizon_px=row, horizon_std_px=std * height)
+
     def for_shape(self, shape: tuple[int, ...]) -> Camera:
         """Return the camera in pixels of frames of ``(height, width, ...)``, another size of the same video.
 
@@ -238,16 +264,40 @@ class Camera:
         201.6
         """
         size = check_shape(shape)
-        if self.shape is None or self.shape == size:
+        if self.shape == size:
             return self
-        scale = _scale_between(self.shape, size)
-        if scale is None:
-            raise InvalidInputError(
-                f"camera must be one for frames of {size[1]}x{size[0]} pixels or the same aspect ratio, got "
-                f"one for {self.shape[1]}x{self.shape[0]}; use Camera.for_frame(image.shape, ...)"
-            )
-        scaled = {name: scale * getattr(self, name) for name in _PIXEL_FIELDS}
-        return dataclasses.replace(self, shape=size, **scaled)
+        height, width = self.shape or _REFERENCE_SHAPE
+        focal_scale, row_scale = max(size) / max(height, width), size[0] / height
+        if self.shape is not None:
+            focal_scale = row_scale = size[1] / width
+            if abs(row_scale * height - size[0]) > 0.01 * size[0]:
+                raise InvalidInputError(
+                    f"camera must be one for frames of {size[1]}x{size[0]} pixels or the same aspect ratio, "
+                    f"got one for {width}x{height}; use Camera.for_frame(image.shape, ...)"
+                )
+        return dataclasses.replace(
+            self,
+            focal_px=focal_scale * self.focal_px,
+            horizon_px=row_scale * self.horizon_px,
+            horizon_std_px=row_scale * self.horizon_std_px,
+            shape=size,
+        )
+
+    @property
+    def horizon(self) -> float:
+        """Row of the horizon as a fraction of the frame's height, 0 at the top."""
+        return self.horizon_px / (self.shape or _REFERENCE_SHAPE)[0]
+
+    @property
+    def horizon_is_known(self) -> bool:
+        """Whether the horizon was given or measured, so that a search may rely on it."""
+        std = self.horizon_std_px / (self.shape or _REFERENCE_SHAPE)[0]
+        return std <= _KNOWN_HORIZON_STD and 0 <= self.horizon <= 1
+
+    @property
+    def lens_is_known(self) -> bool:
+        """Whether the lens was given; if not, distances are rough."""
+        return self.focal_std < _UNKNOWN_LENS_STD
 
     @property
     def pixel_scale(self) -> float:
@@ -335,18 +385,57 @@ class Camera:
         return middle_x + factor * dx, middle_y + factor * dy
 
 
-def _scale_between(given: FrameShape, shape: FrameShape) -> float | None:
-    """Factor from pixels of one frame size to another; None if the aspect ratios differ by more than 1%."""
-    scale = shape[1] / given[1]
-    return scale if abs(scale * given[0] - shape[0]) <= 0.01 * shape[0] else None
-
-
 def _fisheye_radius(angle: Floats, k1: float, k2: float) -> Floats:
     """Distance from the middle of a fisheye frame in focal lengths, for rays at these angles (radians)."""
     return angle * (1 + k1 * angle**2 + k2 * angle**4)
 
 
-def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int, ...]) -> None:
+def open_camera(
+    camera: Camera | str | os.PathLike[str] | None = None,
+    *,
+    fov: float | None = None,
+    height_m: float | None = None,
+    horizon: float | None = None,
+) -> Camera:
+    """Return the camera that a user has stated, of which any part may be unknown.
+
+    Parameters
+    ----------
+    camera
+        A `Camera`, a file of `read_camera`, or the name of a lens, as in `Camera.for_frame`.
+    fov, height_m, horizon
+        As in `Camera.dashcam`; `fov` for an unknown lens, `height_m` also for a named one. `horizon` replaces
+        that of the camera.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed, or states what the camera contains.
+
+    Examples
+    --------
+    >>> open_camera("wide-90", horizon=0.55).horizon_px
+    396.00000000000006
+    """
+    named = camera is None or (isinstance(camera, str) and camera in LENSES)
+    for name, value, allowed in (("fov", fov, camera is None), ("height_m", height_m, named)):
+        if value is not None and not allowed:
+            raise InvalidInputError(f"{name} must be omitted with a camera, which has one; got {value}")
+    if named:
+        lens = None if camera is None else str(camera)
+        return Camera.dashcam(fov=fov, height_m=height_m, horizon=horizon, lens=lens)
+    if not isinstance(camera, Camera):
+        check_type(camera, "camera", (Camera, str, os.PathLike), "omit it for the default")
+        if not os.path.isfile(camera):  # type: ignore[arg-type]
+            raise InvalidInputError(
+                f"camera must be a Camera, a file or one of {', '.join(LENSES)}, got {describe(camera)}; "
+                "omit it"
+            )
+        camera = read_camera(camera)  # type: ignore[arg-type]
+    return camera if horizon is None else camera.with_horizon(horizon)
+
+
+def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int, ...] | None = None) -> None:
     """Write a camera as a JSON file.
 
     Parameters
@@ -354,8 +443,7 @@ def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int,
     camera, path
         The camera, and the file to write, .json.
     shape
-        ``(height, width, ...)`` of the frames that its pixels refer to, or are to be scaled to if the camera
-        has a shape.
+        ``(height, width, ...)`` of the frames to which its pixels are scaled; by default its own shape.
 
     Raises
     ------
@@ -366,83 +454,68 @@ def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int,
     --------
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "camera.json"
-    >>> write_camera(Camera.for_frame((720, 1280), field_of_view=90), file, (720, 1280))
-    >>> round(read_camera(file, (360, 640)).focal_px)
+    >>> write_camera(Camera.for_frame((720, 1280), fov=90), file)
+    >>> round(read_camera(file).for_shape((360, 640)).focal_px)
     320
     """
     check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
-    height, width = check_shape(shape)
+    height, width = check_shape(shape or camera.shape or _REFERENCE_SHAPE)
     values = {"image_size": [width, height], **dataclasses.asdict(camera.for_shape((height, width)))}
     del values["shape"]
     write_text(path, json.dumps(values, indent=2) + "\n", "path")
 
 
-def read_camera(path: str | os.PathLike[str], shape: tuple[int, ...]) -> Camera:
-    """Read a camera from a JSON file, for frames of a shape.
+def read_camera(path: str | os.PathLike[str]) -> Camera:
+    """Read a camera from a JSON file.
 
     Parameters
     ----------
     path
         A file of `write_camera`, or one written by hand. It is an object with attributes of `Camera`, all of
-        them optional. Instead of ``focal_px`` it may hold ``field_of_view`` (degrees along the longer side)
-        or ``lens`` (as in `Camera.for_frame`), and instead of ``horizon_px`` ``horizon`` (a fraction of the
-        height). With pixels it needs ``image_size``, ``[width, height]``; they are scaled to `shape`.
-    shape
-        ``(height, width, ...)`` of the frames.
+        them optional. Instead of ``focal_px`` it may hold ``fov`` (degrees along the longer side) or ``lens``
+        (as in `Camera.for_frame`), and instead of ``horizon_px`` ``horizon`` (a fraction of the height). With
+        pixels it needs ``image_size``, ``[width, height]``.
 
     Returns
     -------
     Camera
-        In pixels of frames of `shape`. A lens or horizon that the file lacks has a large standard error.
+        For frames of the aspect ratio of ``image_size``, or of any. A lens or horizon that the file lacks has
+        a large standard error.
 
     Raises
     ------
     InvalidInputError
-        If the file is missing or malformed, or was made for frames of another aspect ratio.
+        If the file is missing or malformed.
 
     Examples
     --------
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "camera.json"
-    >>> _ = file.write_text('{"field_of_view": 120, "fisheye": true, "k1": 0.02, "height_m": 1.4}')
-    >>> camera = read_camera(file, (720, 1280))
+    >>> _ = file.write_text('{"fov": 120, "fisheye": true, "k1": 0.02, "height_m": 1.4}')
+    >>> camera = read_camera(file)
     >>> round(camera.focal_px), camera.height_m
     (598, 1.4)
     """
-    return _read_camera(check_path(path), check_shape(shape))
-
-
-def check_camera_file(path: str | os.PathLike[str]) -> None:
-    """Raise unless `read_camera` can read a file for frames of the size that it states, or of any size."""
-    _read_camera(check_path(path), None)
-
-
-def _read_camera(path: Path, shape: FrameShape | None) -> Camera:
-    """Camera of a file for frames of a shape; None for the size that the file states."""
+    path = check_path(path)
     values = _read_json(path)
-    height, width = shape or _ANY_SHAPE
     size = values.pop("image_size", None)
-    scale = 1.0
-    if size is not None:
-        if not isinstance(size, list) or len(size) != 2:
-            raise InvalidInputError(f"{path}: image_size must be [width, height], got {describe(size)}")
-        given = [check_integer(side, f"{path}: image_size", low=1) for side in size]
-        if shape is None:
-            width, height = given
-        found = _scale_between((given[1], given[0]), (height, width))
-        if found is None:
-            raise InvalidInputError(
-                f"{path}: image_size must have the aspect ratio of the frames, {width}x{height} pixels, got "
-                f"{given[0]}x{given[1]}; calibrate again, or give field_of_view and horizon"
-            )
-        scale = found
+    if size is not None and (not isinstance(size, list) or len(size) != 2):
+        raise InvalidInputError(f"{path}: image_size must be [width, height], got {describe(size)}")
     pixels = [name for name in _PIXEL_FIELDS if name in values]
     if pixels and size is None:
         raise InvalidInputError(f"{path}: {pixels[0]} needs image_size, [width, height] in pixels; add it")
-    for name in pixels:
-        values[name] = scale * check_number(values[name], f"{path}: {name}")
     try:
-        return _build_camera(values, (height, width))
+        given = (
+            None if size is None else [check_integer(side, "image_size", low=1) for side in reversed(size)]
+        )
+        shape = _REFERENCE_SHAPE if given is None else (given[0], given[1])
+        if "horizon" not in values and "horizon_px" not in values:
+            values = {"horizon": _HORIZON, "horizon_std_px": _HORIZON_STD * shape[0]} | values
+        if "focal_px" not in values and "lens" not in values:
+            values = {"focal_std": _GIVEN_LENS_STD if "fov" in values else _UNKNOWN_LENS_STD} | values
+        derived = {name: values.pop(name) for name in _PIXEL_FIELDS[:2] if name in values}
+        camera = Camera.for_frame(shape, **values)
+        return dataclasses.replace(camera, **derived, shape=None if size is None else shape)
     except InvalidInputError as error:
         raise InvalidInputError(f"{path}: {error}") from None
 
@@ -455,35 +528,16 @@ def _read_json(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else error
         raise InvalidInputError(f"camera file {path} is not JSON: {reason}; see read_camera") from None
-    known = {"image_size", "field_of_view", "lens", "horizon", *Camera.__dataclass_fields__} - {"shape"}
+    known = {"image_size", "fov", "lens", "horizon", *Camera.__dataclass_fields__} - {"shape"}
     if not isinstance(values, dict) or values.keys() - known:
         extra = sorted(values.keys() - known)[0] if isinstance(values, dict) else describe(values)
         raise InvalidInputError(
             f"camera file {path} must be an object with the names {', '.join(sorted(known))}; got {extra}"
         )
-    for first, second in (("field_of_view", "focal_px"), ("lens", "focal_px"), ("horizon", "horizon_px")):
+    for first, second in (("fov", "focal_px"), ("lens", "focal_px"), ("horizon", "horizon_px")):
         if first in values and second in values:
             raise InvalidInputError(f"camera file {path} must hold {first} or {second}, not both; drop one")
     return values
-
-
-def _build_camera(values: dict[str, Any], shape: FrameShape) -> Camera:
-    """Camera of the values of a file, in pixels of frames of this shape."""
-    if "focal_px" in values:
-        horizon = values.pop("horizon", None)
-        if horizon is not None:
-            values["horizon_px"] = check_number(horizon, "horizon", low=-10, high=10) * shape[0]
-        elif "horizon_px" not in values:
-            values |= {"horizon_px": 0.56 * shape[0], "horizon_std_px": 0.05 * shape[0]}
-        return Camera(**values, shape=shape)
-    if "lens" not in values:
-        accuracy = GIVEN_LENS_STD if "field_of_view" in values else UNKNOWN_LENS_STD
-        values = {"focal_std": accuracy} | values
-    if "horizon_px" in values:
-        values["horizon"] = values.pop("horizon_px") / shape[0]
-    elif "horizon" not in values:
-        values = {"horizon_std_px": 0.05 * shape[0]} | values
-    return Camera.for_frame(shape, **values)
 
 
 def lateral_offsets(boxes: NDArray[Any], shape: tuple[int, ...]) -> Floats:
@@ -500,92 +554,3 @@ def truncated_edges(boxes: NDArray[Any], shape: FrameShape) -> NDArray[np.bool_]
     margin = np.maximum(0.04 * (boxes[:, 2:] - boxes[:, :2]), 1.5)
     limit = np.array([shape[1], shape[0]], np.float64)
     return np.concatenate((boxes[:, :2] <= margin, boxes[:, 2:] >= limit - margin), axis=1)
-
-
-@dataclass(frozen=True, kw_only=True)
-class HorizonEstimate:
-    """Estimate of the horizon from the boxes of vehicles.
-
-    Attributes
-    ----------
-    horizon, horizon_std
-        Row of the horizon as a fraction of the frame's height, 0 at the top, and its standard error; treat
-        the estimate as a guess if it exceeds 0.05.
-    camera_height_m
-        Height of the camera above the road in meters, assuming that vehicles are 1.5 m high.
-    n_boxes
-        Number of boxes used.
-    """
-
-    horizon: float
-    horizon_std: float
-    camera_height_m: float
-    n_boxes: int
-
-
-def estimate_horizon(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> HorizonEstimate:
-    """Estimate the height of the horizon from the boxes of vehicles, of one frame or of many.
-
-    On a flat road the bottom edge of a box lies below the horizon by the box's height times the ratio of the
-    camera's height to the vehicle's height: a straight line, whose value at height 0 is the horizon. The
-    box's height is used, because its width includes the side of a vehicle in another lane. The height of most
-    cameras is roughly known (1.35 m, standard deviation 0.3 m), so that boxes of similar sizes suffice. The
-    line is fitted by iteratively reweighted least squares with Tukey's biweight, which ignores trucks and
-    false boxes (Beaton and Tukey, *Technometrics*, 1974).
-
-    Parameters
-    ----------
-    boxes
-        ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, at least 4 of them not truncated.
-    shape
-        ``(height, width, ...)`` of the frames.
-
-    Returns
-    -------
-    HorizonEstimate
-        The horizon as a fraction of the height, its standard error, and the height of the camera.
-
-    Raises
-    ------
-    InvalidInputError
-        If too few boxes are not truncated.
-
-    Examples
-    --------
-    >>> height = np.arange(40, 200, 10)
-    >>> bottom = 396 + 0.9 * height
-    >>> boxes = np.stack([600 - height / 2, bottom - height, 600 + height / 2, bottom], axis=1)
-    >>> found = estimate_horizon(boxes, (720, 1280))
-    >>> round(found.horizon, 3), round(found.camera_height_m, 2)
-    (0.55, 1.35)
-    """
-    frame = check_shape(shape)
-    array = check_boxes(boxes).astype(np.float64)
-    whole = array[~truncated_edges(array, frame).any(axis=1)]
-    if len(whole) < _MIN_BOXES:
-        raise InvalidInputError(
-            f"boxes must contain {_MIN_BOXES} vehicles that are not truncated by the frame, got "
-            f"{len(whole)}; use more frames"
-        )
-    mean = np.array([0.5 * frame[0], _CAMERA_HEIGHT])
-    information = np.diag([1 / (_HORIZON_STD * frame[0]) ** 2, 1 / _CAMERA_HEIGHT_STD**2])
-    size, bottom = (whole[:, 3] - whole[:, 1]) / Camera.vehicle_height_m, whole[:, 3]
-    edge_std = _EDGE_STD_PX * max(frame) / 1280
-    found = np.array([np.median(bottom - _CAMERA_HEIGHT * size), _CAMERA_HEIGHT])
-    for _ in range(30):
-        variance = edge_std**2 + np.square(_RELATIVE_STD * found[1] * size)
-        residual = (bottom - found[0] - found[1] * size) / np.sqrt(variance)
-        weight = np.square(np.maximum(1 - np.square(residual / _BIWEIGHT), 0)) / variance / _CORRELATED_BOXES
-        crossed = (weight * size).sum()
-        normal = information + np.array([[weight.sum(), crossed], [crossed, (weight * size * size).sum()]])
-        vector = np.array([(weight * bottom).sum(), (weight * size * bottom).sum()])
-        found = np.linalg.solve(normal, vector + information @ mean)
-    std = math.sqrt(np.linalg.inv(normal)[0, 0])
-    # Boxes that do not lie on a line are no vehicles on a flat road.
-    std *= max(1.0, float(np.percentile(np.abs(residual), 80)) / _NORMAL_80)
-    return HorizonEstimate(
-        horizon=float(found[0]) / frame[0],
-        horizon_std=std / frame[0],
-        camera_height_m=float(found[1]),
-        n_boxes=len(whole),
-    )

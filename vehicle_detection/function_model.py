@@ -1,4 +1,4 @@
-"""Detectors from elsewhere: any function that finds boxes in an image, as a model of `VehicleDetector`."""
+"""Detectors from elsewhere: any function that finds boxes in an image, as a model (`detector_from`)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_bool, check_type, describe, store_number
+from vehicle_detection._common import Checked, check_bool, check_type, describe, number
 from vehicle_detection.boxes import (
     Detections,
     Platt,
@@ -26,6 +26,7 @@ from vehicle_detection.boxes import (
     logit,
     select_classes,
 )
+from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.search import FrameSearch
 
@@ -33,48 +34,26 @@ DetectorFunction = Callable[[NDArray[np.uint8]], Any]
 
 
 @dataclass(frozen=True, kw_only=True)
-class FunctionParams:
+class FunctionParams(Checked):
     """Parameters of a detector that is a function: it searches the whole frame by itself.
 
     Attributes
     ----------
-    horizon
-        Row of the horizon as a fraction of the frame's height, for distances; None: estimated.
-    horizon_tolerance
-        Error of the horizon as a fraction of the frame's height.
     min_score
         Minimum score, in log-odds, of the boxes that count as positive windows.
 
     Examples
     --------
-    >>> FunctionParams().with_horizon(0.55).horizon
-    0.55
+    >>> FunctionParams(min_score=1).min_score
+    1
     """
 
-    horizon: float | None = None
-    horizon_tolerance: float = 0.15
-    min_score: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.horizon is not None:
-            store_number(self, "horizon", low=0, high=1)
-        store_number(self, "horizon_tolerance", low=0, high=1)
-        store_number(self, "min_score")
+    min_score: float = number(0.0)
 
     @classmethod
     def default(cls) -> FunctionParams:
         """Return the default parameters."""
         return cls()
-
-    def with_horizon(self, horizon: float | None) -> FunctionParams:
-        """Return the same parameters with a known horizon and a lower tolerance; None changes nothing."""
-        if horizon is None:
-            return self
-        return dataclasses.replace(self, horizon=horizon, horizon_tolerance=0.06)
-
-    def everywhere(self) -> FunctionParams:
-        """Return the same parameters: a function searches all rows."""
-        return self
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -132,9 +111,19 @@ class FunctionModel:
             limit = logit(limit)
         return Platt(-1.0, -limit)
 
-    def open_search(self, n_jobs: int | None = None) -> FunctionSearch:
-        """Open a search of frames that calls the function; `n_jobs` has no effect."""
-        return FunctionSearch(self, n_jobs)
+    def with_confidence(self, conf: float) -> FunctionModel:
+        """Return the model with the threshold at this probability."""
+        if isinstance(self.score, tuple):
+            raise InvalidInputError(
+                f"conf must be None for scores on a scale of their own, got {conf:g}; change the lower end "
+                "of score=(low, high), or return probabilities"
+            )
+        threshold = conf if self.score == "probability" else logit(conf)
+        return dataclasses.replace(self, threshold=threshold)
+
+    def open_search(self, jobs: int | None = None) -> FunctionSearch:
+        """Open a search of frames that calls the function; `jobs` has no effect."""
+        return FunctionSearch(self, jobs)
 
     def summary(self) -> tuple[str, dict[str, str]]:
         """Describe the model for display: a title, and named facts."""
@@ -198,8 +187,8 @@ class FunctionSearch(FrameSearch):
 
     params_type = FunctionParams
 
-    def __init__(self, model: FunctionModel, n_jobs: int | None = None) -> None:
-        super().__init__(n_jobs)
+    def __init__(self, model: FunctionModel, jobs: int | None = None) -> None:
+        super().__init__(jobs)
         self._model = model
 
     def _search(
@@ -207,3 +196,82 @@ class FunctionSearch(FrameSearch):
     ) -> tuple[Detections, Detections]:
         found = self._model.find(frame)
         return found[found.scores >= params.min_score], found[found.scores >= min_vehicle_score]
+
+
+def detector_from(
+    function: DetectorFunction,
+    *,
+    score: ScoreScale = "probability",
+    threshold: float | None = None,
+    class_ids: Collection[int] | None = None,
+    thread_safe: bool = False,
+    name: str | None = None,
+    **options: Any,
+) -> VehicleDetector:
+    """Make a detector of any function that finds boxes: to track, draw, evaluate and render with it.
+
+    Parameters
+    ----------
+    function
+        Called with an ``(H, W, 3)`` uint8 RGB image of its own. It returns ``(boxes, scores)``, ``(N, 4)``
+        ``[x1, y1, x2, y2]`` in pixels and ``(N,)``, or ``(boxes, scores, classes)``; or `Detections`, or an
+        object with ``xyxy``, such as ``supervision.Detections`` and the ``boxes`` of Ultralytics' results
+        (see `Detections.from_supervision`). Boxes are clipped to the image. It should
+        return weak boxes as well: the tracker uses them, images show only those above the threshold.
+    score
+        What the scores are. They are converted to log-odds above the threshold, the unit of `TrackParams`:
+        ``"probability"``, 0 to 1; ``"logit"``, log-odds; ``(low, high)``, any scale, of which `low` is the
+        threshold and becomes 0, and `high`, a certain vehicle, becomes 3 (95%).
+    threshold
+        Score from which a box is a vehicle in a single image: by default 0.5 for probabilities and 0 for
+        log-odds. Pass 0.25 if that is the usual threshold of your detector.
+    class_ids
+        Keep only boxes of these classes, integers as the function returns them.
+    thread_safe
+        Whether the function may be called from several threads. `process_video` searches several frames at
+        once; with False the calls wait for each other. Sessions of ONNX Runtime and the ``predict`` of
+        scikit-learn are thread-safe.
+    name
+        Name in messages; by default that of the function.
+    **options
+        Further arguments of `VehicleDetector`, such as ``track_params`` and ``camera``.
+
+    Returns
+    -------
+    VehicleDetector
+        Its `detect`, `process`, `annotate_clip` and so on work as with the shipped models.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed.
+    DetectorError
+        In the methods of the detector, if the function fails or returns something else; the message names
+        the function and the frame.
+
+    Notes
+    -----
+    With the defaults of `TrackParams`, scores from 0 on are vehicles in a single image; tracks start from
+    -0.3 on (a probability of 0.43), are confirmed at an average of 0.2 (0.55), and are continued by boxes
+    down to -1.5 (0.18). The probabilities hold for a threshold of 0.5.
+
+    Examples
+    --------
+    >>> def bright_spot(image):
+    ...     y, x = np.unravel_index(image.sum(axis=2).argmax(), image.shape[:2])
+    ...     return [[x - 20, y - 20, x + 20, y + 20]], [0.9]
+    >>> detector = detector_from(bright_spot)
+    >>> image = np.zeros((90, 160, 3), np.uint8)
+    >>> image[50, 100] = 255
+    >>> detector.detect(image).boxes.tolist()
+    [[80.0, 30.0, 120.0, 70.0]]
+    """
+    model = FunctionModel(
+        function=function,
+        score=score,
+        threshold=threshold,
+        class_ids=class_ids,
+        thread_safe=thread_safe,
+        name=name,
+    )
+    return VehicleDetector(model, **options)

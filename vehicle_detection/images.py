@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import importlib
 import io
 import os
@@ -26,28 +25,6 @@ from vehicle_detection._common import (
     read_regular_file,
 )
 from vehicle_detection.errors import InvalidInputError
-
-_THUMBNAIL_SHAPE = (18, 32)
-# Mean absolute difference of the thumbnails of consecutive frames, 0-255, above which the scene has been cut.
-_CUT_DIFFERENCE = 40.0
-
-
-def make_thumbnail(frame: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Gray thumbnail of a frame, ``(18, 32)`` float32, for `is_cut`; subsampling is enough for it."""
-    return np.asarray(frame[_thumbnail_pixels(frame.shape[:2])].mean(axis=2, dtype=np.float32))
-
-
-@functools.lru_cache(8)
-def _thumbnail_pixels(shape: tuple[int, ...]) -> tuple[NDArray[np.intp], ...]:
-    """Rows and columns of the pixels of a thumbnail."""
-    sides = zip(shape, _THUMBNAIL_SHAPE)
-    return np.ix_(*(np.linspace(0, side - 1, count).astype(np.intp) for side, count in sides))
-
-
-def is_cut(first: NDArray[np.float32], second: NDArray[np.float32]) -> bool:
-    """Whether the scene was cut between two consecutive frames, given their thumbnails."""
-    return float(cv2.norm(first, second, cv2.NORM_L1)) > _CUT_DIFFERENCE * first.size
-
 
 # What a format's files begin with, and the class of Pillow that reads their header.
 _HEADERS = {

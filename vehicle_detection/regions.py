@@ -9,6 +9,7 @@ and with it the difference between window and box.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,6 +60,12 @@ class RegionParams(Checked):
     flank_shift: float = number(0.27, above=0, high=2)
     max_coverage: float = number(0.5, low=0, high=1)
     flank_peak_ratio: float = number(0.5, low=0, high=1)
+
+    def with_peak(self, score: float) -> RegionParams:
+        """Return parameters for another minimum of the best score, and of the evidence in proportion."""
+        peak = max(score, 0.0)
+        evidence = self.min_evidence * min(peak / max(self.min_peak, 1e-9), 1.0)
+        return dataclasses.replace(self, min_peak=peak, min_evidence=evidence)
 
 
 def find_vehicles(

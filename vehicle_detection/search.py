@@ -55,7 +55,6 @@ from vehicle_detection._kernels import features as kernels
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE, FeatureParams, convert_color, hog_source
-from vehicle_detection.images import make_thumbnail
 
 REFERENCE_WIDTH = 1280
 """Search windows are given in pixels of a frame whose longer side has this length."""
@@ -273,8 +272,6 @@ class SearchResult:
         are kept for tracking only.
     shape
         ``(height, width)`` of the frame.
-    thumbnail
-        ``(18, 32)`` float32 gray copy of the frame, for detecting scene cuts.
     seconds
         Duration of the search.
     """
@@ -282,7 +279,6 @@ class SearchResult:
     windows: Detections
     vehicles: Detections | None
     shape: tuple[int, int]
-    thumbnail: NDArray[np.float32]
     seconds: float
 
     def __repr__(self) -> str:
@@ -319,13 +315,12 @@ class FrameSearch(Closing, ABC):
         An error says what is malformed, or that a search with `SearchParams` has no window in the frame.
         """
         start = time.perf_counter()
-        check_image(frame, "frame")
+        height, width, _ = check_image(frame, "frame").shape
         params = self.params_type.default() if params is None else params
         check_type(params, "params", self.params_type, "omit it for the default")
         min_score = check_number(min_vehicle_score, "min_vehicle_score")
         windows, vehicles = self._search(frame, params, min_score)
-        thumbnail, shape = make_thumbnail(frame), (frame.shape[0], frame.shape[1])
-        return SearchResult(windows, vehicles, shape, thumbnail, time.perf_counter() - start)
+        return SearchResult(windows, vehicles, (height, width), time.perf_counter() - start)
 
     @abstractmethod
     def _search(

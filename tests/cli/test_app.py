@@ -124,7 +124,7 @@ def test_ctrl_c_leaves_nothing_behind(tmp_path, material):
 
 
 def test_an_interrupted_command_leaves_no_file(monkeypatch, picture, tmp_path):
-    monkeypatch.setattr(detector.VehicleDetector, "detect", failing(KeyboardInterrupt()))
+    monkeypatch.setattr(detector.Detector, "detect", failing(KeyboardInterrupt()))
     result = run("detect", picture, "-o", tmp_path / "a" / "b", "--boxes", tmp_path / "boxes.csv")
     assert (result.exit_code, result.stdout, result.stderr) == (130, "", "interrupted\n")
     assert contents(tmp_path) == []
@@ -137,7 +137,7 @@ def test_a_full_disk_is_one_line(monkeypatch, picture, tmp_path):
 
 
 def test_unexpected_errors_keep_their_traceback(monkeypatch, picture):
-    monkeypatch.setattr(detector.VehicleDetector, "detect", failing(RuntimeError("a bug")))
+    monkeypatch.setattr(detector.Detector, "detect", failing(RuntimeError("a bug")))
     with pytest.raises(RuntimeError, match="a bug"):
         run("detect", picture)
 

@@ -23,7 +23,7 @@ def test_detect_writes_annotated_images_and_boxes(monkeypatch, picture, tmp_path
         Detections.empty(),
     ]
     answers = iter(found)
-    monkeypatch.setattr(detector.VehicleDetector, "detect", lambda self, image: next(answers))
+    monkeypatch.setattr(detector.Detector, "detect", lambda self, image: next(answers))
     other, folder, boxes = tmp_path / "other.jpg", tmp_path / "new" / "out", tmp_path / "boxes.csv"
     write_image(other, read_image(picture))
     out = succeed("detect", picture, other, "-o", folder, "--boxes", boxes)
@@ -48,7 +48,7 @@ def test_detect_writes_annotated_images_and_boxes(monkeypatch, picture, tmp_path
 
 def test_detect_draws_scores_and_lines_as_asked(monkeypatch, picture, tmp_path):
     found = Detections([[100, 60, 180, 120]], [1.5])
-    monkeypatch.setattr(detector.VehicleDetector, "detect", lambda self, image: found)
+    monkeypatch.setattr(detector.Detector, "detect", lambda self, image: found)
     image, changed = read_image(picture), {}
     for name, words in {"plain": [], "bare": ["--labels", "none"], "wide": ["--line-width", 5]}.items():
         succeed("detect", picture, "-o", tmp_path / name, *words)

@@ -407,7 +407,7 @@ def test_closed_outputs(tmp_path, closed):
     ],
 )
 def test_errors_of_the_system_are_one_line(monkeypatch, clip, tmp_path, error, message):
-    monkeypatch.setattr(detector.VehicleDetector, "search", failing(error))
+    monkeypatch.setattr(detector.Detector, "search", failing(error))
     result = run("video", clip, "-o", tmp_path / "out.mp4", "--model", "highway")
     assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
     assert result.stderr.startswith(message)

@@ -8,9 +8,9 @@ import numpy as np
 
 from tests.cli.commands import contents, patches_of, refuse, refuse_each, succeed
 from vehicle_detection import datasets, training
+from vehicle_detection.detector import load_model
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import write_image
-from vehicle_detection.loading import load_model
 from vehicle_detection.svm import VehicleClassifier, load_classifier
 
 

@@ -15,12 +15,12 @@ from tests.cli.commands import HEADER, contents, refuse, refuse_each, run, succe
 from tests.video.clips import damage_sizes, write_clip
 from vehicle_detection import video
 from vehicle_detection.annotator import DrawParams
-from vehicle_detection.camera import HorizonEstimate
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.cli.options import parse_time
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import write_image
 from vehicle_detection.scenes import render_drive
+from vehicle_detection.tracking import HorizonEstimate
 from vehicle_detection.video import FrameSource, probe_video, read_frames
 
 
@@ -49,7 +49,7 @@ def test_video_takes_the_camera(tmp_path):
     drive = render_drive(frames=12, shape=(720, 1280), scenario="crossing", random_state=1)
     draw_clip(drive, clip, tmp_path / "labels.csv")
     camera = tmp_path / "camera.json"
-    camera.write_text('{"field_of_view": 120, "height_m": 1.3}')
+    camera.write_text('{"fov": 120, "height_m": 1.3}')
     for words in ((), ("--fov", 58), ("--fov", 120, "--camera-height", 1.3), ("--camera", camera)):
         tracks = tmp_path / "tracks.csv"
         result = run("video", clip, "-o", tmp_path / "out.mp4", "--tracks", tracks, *words)
@@ -73,7 +73,7 @@ def test_video_warns_of_a_wrong_horizon(clip, tmp_path, monkeypatch):
     result = run(*words, "--horizon", 0.95)
     assert "warning: no vehicle was found with --horizon 0.95, but a search of all rows" in result.stderr
     camera = tmp_path / "camera.json"
-    camera.write_text('{"field_of_view": 58, "horizon": 0.95}')
+    camera.write_text('{"fov": 58, "horizon": 0.95}')
     result = run(*words, "--camera", camera)
     assert f"warning: no vehicle was found with the horizon of --camera {camera}, but" in result.stderr
 
@@ -209,7 +209,7 @@ def test_video_draws_as_asked(clip, tmp_path, monkeypatch):
     process = video.process_video
 
     def watch(source, target, detector, **options):
-        drawn.append(detector.draw_params)
+        drawn.append(detector.annotator.style)
         return process(source, target, detector, **options)
 
     monkeypatch.setattr(video, "process_video", watch)
@@ -292,7 +292,7 @@ BAD_VIDEOS = {
 BAD_CAMERAS = {
     "{clip} -o out.mp4 --camera wide-90 --fov 90": "--fov must be omitted with a camera",
     "{clip} -o out.mp4 --camera gopro": "--camera must be one of standard-58, .* or state the lens",
-    "{clip} -o out.mp4 --camera lens.json": "lens.json: image_size must have the aspect ratio",
+    "{clip} -o out.mp4 --camera lens.json": "--camera must be one for frames of 480x270",
     "{clip} -o out.mp4 --camera-height 0": "--camera-height must be a number",
     "{clip} -o out.mp4 --fov 200": "--fov must be a number, at least 1 and at most 170",
     "{clip} -o out.mp4 --conf 2": "--conf must be a number",

@@ -49,7 +49,7 @@ def test_outputs_are_partitioned_and_equal_process_video(card, model, tmp_path):
     )
     expected = tmp_path / "expected.csv"
     single = card / "20260131_093000_F.mp4"
-    with VehicleDetector(model, n_jobs=1) as detector, open_tracks(expected) as write:
+    with VehicleDetector(model, jobs=1) as detector, open_tracks(expected) as write:
         process_video(single, tmp_path / "expected.mp4", detector, workers=1, on_result=write)
     (record,) = (each for each in found.values() if each["start"] == "2026-01-31T09:30:00")
     assert (out / record["outputs"]["video"]).read_bytes() == (tmp_path / "expected.mp4").read_bytes()
@@ -106,7 +106,7 @@ def test_another_camera_file_changes_the_results(card, model, tmp_path):
     camera, one = tmp_path / "camera.json", str(card / "*0930*")
     options = {"tracks_only": True, "options": {"camera": str(camera)}}
     for angle, done in ((60, 1), (60, 0), (120, 1)):
-        camera.write_text(json.dumps({"field_of_view": angle}))
+        camera.write_text(json.dumps({"fov": angle}))
         assert counts(run(one, tmp_path / "out", model, **options)) == (done, 0, 0, 1 - done)
     check_whole(tmp_path / "out", done=1, failed=0)
 
@@ -441,7 +441,7 @@ def test_an_error_cancels_trips_that_have_not_begun(many, model, tmp_path):
 
 def test_options_of_other_types(card, model, tmp_path):
     camera = tmp_path / "camera.json"
-    camera.write_text('{"field_of_view": 90}')
+    camera.write_text('{"fov": 90}')
     options = {"camera": camera, "conf": np.float32(0.5), "every": np.int64(3)}
     one = card / "20260131_093000_F.mp4"
     assert counts(run(one, tmp_path / "out", model, tracks_only=True, options=options)) == (1, 0, 0, 0)

@@ -29,7 +29,7 @@ def test_a_card_of_twelve_segments_is_one_trip_with_one_identity_per_vehicle(tmp
     trips = find_trips(card.iterdir(), duration=lambda file: probe_video(file).duration)
     assert [(trip.camera, len(trip.files)) for trip in trips] == [("front", SEGMENTS), ("rear", 2)]
     out = tmp_path / "out"
-    report = run(card, out, "default", tracks_only=True, options={"field_of_view": 58})
+    report = run(card, out, "default", tracks_only=True, options={"fov": 58})
     assert counts(report) == (2, 0, 0, 0)
     found = {record["camera"]: record for record in check_whole(out, done=2, failed=0).values()}
     assert found["front"]["frames"] == FRAMES * SEGMENTS

@@ -43,7 +43,7 @@ class ScriptedDetector:
     def search(self, frame):
         return None
 
-    def track(self, found, *, time):
+    def track(self, found, *, time, frames, cut):
         self.index += 1
         box = np.array([100.0 + self.index, 120, 180 + self.index, 180])
         first = Track(
@@ -76,7 +76,7 @@ def folder(tmp_path_factory):
     (folder / "pages").mkdir()
     drive = render_drive(frames=FRAMES, fps=FPS, shape=(270, 480), scenario="empty")
     draw_clip(drive, folder / SOURCE, folder / "labels.csv")
-    with VehicleDetector(n_jobs=1) as detector:
+    with VehicleDetector(jobs=1) as detector:
         about = {"video": folder / TARGET, "source": folder / SOURCE, "detector": detector}
         writers = [
             ReportWriter(folder / "embedded.html", **about),

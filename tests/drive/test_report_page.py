@@ -28,13 +28,12 @@ from tests.drive.report_helpers import (
     write_report,
 )
 from vehicle_detection.camera import Camera
-from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.detector import VehicleDetector, load_model
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.drive import Event, ReportWriter, TrackPicture
 from vehicle_detection.drive import report_page as page
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import HeatParams
-from vehicle_detection.loading import load_model
 from vehicle_detection.svm import load_classifier
 from vehicle_detection.tracking import TrackParams
 
@@ -50,7 +49,7 @@ def video(tmp_path_factory):
 
 class TestPage:
     def test_is_complete_and_self_contained(self, tmp_path, video):
-        with VehicleDetector(n_jobs=1) as detector:
+        with VehicleDetector(jobs=1) as detector:
             text = write_report(tmp_path, FRAMES, video=video, source="drive.mp4", detector=detector)
         parsed = StrictParser(text)
         assert text.startswith("<!DOCTYPE html>\n")
@@ -152,7 +151,7 @@ class TestPage:
 
     def test_notices(self, tmp_path):
         assert '<ul class="notices">' not in write_report(tmp_path, FRAMES)
-        writer = ReportWriter(tmp_path / "report.html", detector=SimpleNamespace(lens_is_known=False))
+        writer = ReportWriter(tmp_path / "report.html", detector=SimpleNamespace(camera=Camera.dashcam()))
         writer.table.append(0, 0.0, [track(1)])
         writer.finish(video_report(1, damage="<a>.mp4 is damaged: 3 frames are missing", dropped=2))
         text = (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -170,7 +169,7 @@ class TestPage:
         assert "<li>drive.mp4 is incomplete.</li>" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
     def test_an_unknown_lens_matters_for_distances_only(self, tmp_path):
-        detector = SimpleNamespace(lens_is_known=False)
+        detector = SimpleNamespace(camera=Camera.dashcam())
         text = write_report(tmp_path, [[track(1, distance=None, speed=None)]], detector=detector)
         assert "The lens is unknown" not in text
 
@@ -266,7 +265,7 @@ class TestSettingsAndModel:
     def test_of_a_classifier_of_patches(self, tmp_path):
         camera = Camera.for_frame((720, 1280), height_m=1.75)
         options = {"camera": camera, "track_params": TrackParams(confirm_score=0.625)}
-        with VehicleDetector("highway", n_jobs=1, **options) as detector:
+        with VehicleDetector("highway", jobs=1, **options) as detector:
             text = write_report(tmp_path, FRAMES, detector=detector)
         assert "<dt>confirm score</dt><dd>0.625</dd>" in text
         assert "<dt>height m</dt><dd>1.75</dd>" in text
@@ -281,9 +280,9 @@ class TestSettingsAndModel:
         assert "CC BY-NC-SA 3.0" in text
 
     def test_of_a_network(self, tmp_path):
-        with VehicleDetector(n_jobs=1, horizon=0.5) as detector:
+        with VehicleDetector(jobs=1) as detector:
             text = write_report(tmp_path, FRAMES, detector=detector)
-        assert "<dt>horizon</dt><dd>0.5</dd>" in text
+        assert "<dt>horizon px</dt><dd>360</dd>" in text
         assert "<summary>Camera (assumed)</summary>" in text
         assert "Regions" not in text
         title, facts = load_model().summary()
@@ -295,17 +294,17 @@ class TestSettingsAndModel:
         assert "inherits the terms of the data" in text
 
     @pytest.mark.parametrize(
-        ("options", "focal"), [({"field_of_view": 90}, "640"), ({"camera": "fisheye-120"}, "611.155")]
+        ("camera", "focal"), [(Camera.dashcam(fov=90), "640"), ("fisheye-120", "611.155")]
     )
-    def test_of_a_lens(self, tmp_path, options, focal):
+    def test_of_a_lens(self, tmp_path, camera, focal):
         """The camera is the one that the distances are computed with."""
-        with VehicleDetector(n_jobs=1, **options) as detector:
+        with VehicleDetector(jobs=1, camera=camera) as detector:
             text = write_report(tmp_path, FRAMES, detector=detector)
         assert "<summary>Camera</summary>" in text
         assert f"<dt>focal px</dt><dd>{focal}</dd>" in text
 
     def test_of_the_heat_map_of_the_course(self, tmp_path):
-        with VehicleDetector(n_jobs=1, region_params=HeatParams(threshold=2), horizon=0.5) as detector:
+        with VehicleDetector(jobs=1, region_params=HeatParams(threshold=2)) as detector:
             text = write_report(tmp_path, FRAMES, detector=detector)
         assert "<summary>Regions (heat map)</summary>" in text
         assert "<dt>threshold</dt><dd>2</dd>" in text

@@ -21,7 +21,7 @@ RUNTIMES = [
 
 @pytest.mark.parametrize("runtime", RUNTIMES)
 def test_a_session_runs_inputs_of_any_size(runtime):
-    session = open_session(own_network(), "the network", n_jobs=1, runtime=runtime)
+    session = open_session(own_network(), "the network", jobs=1, runtime=runtime)
     for height in (32, 64, 96, 128, 160, 192, 64):
         (boxes,) = session.run({"image": np.zeros((1, height, 64, 3), np.uint8)})
         assert boxes.shape == (1, 5, height // 16)

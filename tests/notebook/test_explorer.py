@@ -9,11 +9,10 @@ import pytest
 from vehicle_detection.boxes import Detections, iou_matrix
 from vehicle_detection.camera import Camera
 from vehicle_detection.datasets import load_frames
-from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.detector import VehicleDetector, load_model
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import HeatParams, frame_heat
 from vehicle_detection.images import write_image
-from vehicle_detection.loading import load_model
 from vehicle_detection.network import NetworkParams
 from vehicle_detection.notebook import Explorer
 from vehicle_detection.notebook import explorer as module
@@ -64,9 +63,11 @@ def test_windows_and_boxes_equal_those_of_the_detector(scenes, model, method, mi
     explorer.set_search(min_score=min_score, horizon=0.56)
     explorer.set_regions(method, threshold=0.5)
     kind = type(explorer.search_params)
-    search_params = dataclasses.replace(kind.default().with_horizon(0.56), min_score=min_score)
+    search_params = dataclasses.replace(kind.default(), min_score=min_score)
+    if model == "highway":
+        search_params = search_params.with_horizon(0.56)
     region_params = HeatParams(threshold=0.5) if method == "heat" else RegionParams()
-    expected = VehicleDetector(model, region_params=region_params, search_params=search_params, n_jobs=1)
+    expected = VehicleDetector(model, region_params=region_params, search_params=search_params, jobs=1)
     for number, scene in enumerate(scenes):
         explorer.set_frame(number)
         windows, found = expected.search(scene).windows, expected.detect(scene)
@@ -75,7 +76,7 @@ def test_windows_and_boxes_equal_those_of_the_detector(scenes, model, method, mi
         for actual, wanted in (
             (explorer.windows(), windows),
             (explorer.boxes(), found),
-            (explorer.detector(n_jobs=1).detect(scene), found),
+            (explorer.detector(jobs=1).detect(scene), found),
         ):
             np.testing.assert_array_equal(actual.boxes, wanted.boxes)
             np.testing.assert_array_equal(actual.scores, wanted.scores)
@@ -86,11 +87,11 @@ def test_windows_and_boxes_equal_those_of_the_detector(scenes, model, method, mi
 @pytest.mark.parametrize("model", ["default", "highway"])
 def test_a_camera_is_that_of_the_detector(scenes, model, tmp_path):
     file = tmp_path / "camera.json"
-    file.write_text('{"field_of_view": 90, "horizon": 0.56}')
+    file.write_text('{"fov": 90, "horizon": 0.56}')
     for camera in (file, "wide-90"):
         explorer = Explorer(scenes, model, camera=camera)
-        with VehicleDetector(model, camera=camera, n_jobs=1) as detector:
-            assert explorer.search_params == detector.search_params_of(SHAPE)
+        with VehicleDetector(model, camera=camera, jobs=1) as detector:
+            assert explorer.search_params == detector.detector.search_params
             np.testing.assert_array_equal(explorer.boxes().boxes, detector.detect(scenes[0]).boxes)
 
 
@@ -101,16 +102,16 @@ def test_the_given_parameters_are_used(scenes):
     heated = explore(scenes, search_params=params, region_params=counted, camera=camera)
     assert heated.method == "heat"
     np.testing.assert_array_equal(heated.heat_map(), frame_heat(SHAPE, heated.windows(), counted))
-    detector = heated.detector(n_jobs=1)
-    assert detector.camera is camera
-    assert detector.region_params == counted.for_search(params)
-    assert detector.search_params == params
+    detector = heated.detector(jobs=1)
+    assert detector.camera == camera
+    assert detector.detector.region_params == counted.for_search(params)
+    assert detector.detector.search_params == params
     heated.set_regions(
         "groups", threshold=4.0, peak_fraction=0.1, weighting="score", min_peak=0.2, min_evidence=0.3
     )
     assert heated.heat_params == HeatParams(threshold=4.0, peak_fraction=0.1)
     assert heated.group_params == heated.region_params == RegionParams(min_peak=0.2, min_evidence=0.3)
-    assert heated.detector(n_jobs=1).region_params == heated.group_params
+    assert heated.detector(jobs=1).detector.region_params == heated.group_params
     assert heated.method == "groups"
     heated.set_regions(threshold=0.0)
     assert (heated.heat_params.threshold, heated.method) == (0.0, "groups")
@@ -126,12 +127,13 @@ def test_the_model_is_a_name_a_path_or_a_model(scenes, tmp_path):
         np.testing.assert_array_equal(Explorer(scenes, same).boxes().boxes, expected)
 
 
-def test_the_horizon_of_a_network_may_be_unknown(scenes):
-    explorer = Explorer(scenes, search_params=NetworkParams(horizon=None))
+def test_the_horizon_of_a_network_is_that_of_the_camera(scenes):
+    explorer = Explorer(scenes)
     assert explorer.bands == ()
     image = explorer.render()
     explorer.set_search(horizon=0.56)
-    assert explorer.search_params == NetworkParams().with_horizon(0.56)
+    assert explorer.camera.horizon == pytest.approx(0.56)
+    assert explorer.detector(camera="wide-90").camera.horizon == pytest.approx(0.56)
     assert (explorer.render() != image).any()
     with pytest.raises(InvalidInputError, match="bands must be None"):
         explorer.set_search(bands=[0])
@@ -170,7 +172,7 @@ def test_bands_are_selected(explorer):
     explorer.set_search(bands=(3, 1, 3))
     assert explorer.bands == (1, 3)
     assert len(explorer.windows()) == len(parts[1]) + len(parts[3])
-    assert len(explorer.detector(n_jobs=1).search_params.bands) == 2
+    assert len(explorer.detector(jobs=1).detector.search_params.bands) == 2
     explorer.set_search(bands=())
     assert len(explorer.windows()) == 0
     assert explorer.render().shape == (*SHAPE, 3)
@@ -421,7 +423,7 @@ def test_controls_without_effect_are_disabled(panel):
 
 
 def test_a_network_has_no_controls_for_bands_and_groups(scenes):
-    explorer = Explorer(scenes, search_params=NetworkParams(horizon=None))
+    explorer = Explorer(scenes)
     controls, text, _ = open_panel(explorer)
     assert list(controls) == [
         "frame", "show", "explain box", "min. score", "horizon", "boxes from", "min. heat", "peak fraction",
@@ -429,9 +431,10 @@ def test_a_network_has_no_controls_for_bands_and_groups(scenes):
     ]  # fmt: skip
     controls["min. score"].value = 0.5
     # Only changed controls are applied: the horizon is still unknown.
-    assert explorer.search_params == NetworkParams(horizon=None, min_score=0.5)
+    assert explorer.search_params == NetworkParams(min_score=0.5)
+    assert not explorer.camera.horizon_is_known
     controls["horizon"].value = 0.56
-    assert explorer.search_params.horizon == 0.56
+    assert explorer.camera.horizon == pytest.approx(0.56)
     assert text.value == explorer.summary()
 
 

@@ -36,7 +36,7 @@ class TestShipped:
 
     def test_the_model_finds_every_vehicle_of_single_frames(self):
         drive = render_drive(**RECORD["scene"])
-        with VehicleDetector(n_jobs=1) as detector:
+        with VehicleDetector(jobs=1) as detector:
             for frame in (0, len(drive) - 1):
                 scene = drive[frame]
                 assert pictures.find_errors([detector.detect(scene.image).boxes], [scene.truth]) == [], HINT

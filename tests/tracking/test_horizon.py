@@ -3,8 +3,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.helpers import boxes_on_a_road
 from vehicle_detection.camera import Camera, truncated_edges
-from vehicle_detection.tracking.horizon import HorizonFilter
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tracking.horizon import HorizonFilter, estimate_horizon
 
 FRAME = (720, 1280)
 TRUE = Camera.for_frame(FRAME, horizon=0.56)
@@ -178,3 +180,63 @@ def test_vehicles_of_long_ago_are_forgotten():
     # The first weight decays by exp(-t / 30 s); the others sum to 3.5 of its initial value.
     assert known[1:20] == [2] * 19
     assert known[25:] == [1] * 5
+
+
+@given(st.floats(0.35, 0.6), st.floats(0.9, 2.0), st.integers(0, 1000))
+def test_horizon_of_a_flat_road_is_nearly_exact(horizon, camera_height, seed):
+    found = estimate_horizon(boxes_on_a_road(horizon, camera_height, seed=seed), FRAME)
+    assert found.horizon == pytest.approx(horizon, abs=0.015)
+    assert found.camera_height_m == pytest.approx(camera_height, rel=0.1)
+    assert found.horizon_std < 0.015
+
+
+def test_standard_error_is_realistic_and_shrinks_with_more_boxes():
+    few, many = (
+        [estimate_horizon(boxes_on_a_road(0.5, 1.3, count, seed, 0.08), FRAME) for seed in range(12)]
+        for count in (20, 200)
+    )
+    for found in (few, many):
+        spread = np.sqrt(np.mean([(each.horizon - 0.5) ** 2 for each in found]))
+        assert spread < 2.5 * np.mean([each.horizon_std for each in found])
+    assert np.mean([each.horizon_std for each in many]) < 0.6 * np.mean([each.horizon_std for each in few])
+
+
+def test_false_boxes_and_trucks_hardly_change_the_horizon():
+    boxes = boxes_on_a_road(0.5, 1.3, 60)
+    boxes[::6, 1::2] -= 150
+    boxes[1::6, 1] -= boxes[1::6, 3] - boxes[1::6, 1]
+    assert estimate_horizon(boxes, FRAME).horizon == pytest.approx(0.5, abs=0.03)
+
+
+def test_the_sides_of_vehicles_do_not_change_the_horizon():
+    boxes = boxes_on_a_road(0.5, 1.3, 30)
+    wider = boxes.copy()
+    wider[:, 2] += 60
+    assert estimate_horizon(wider, FRAME).horizon == pytest.approx(estimate_horizon(boxes, FRAME).horizon)
+
+
+def test_a_few_boxes_of_one_size_give_an_uncertain_horizon():
+    boxes = np.tile([[600.0, 400.0, 660.0, 450.0]], (20, 1))
+    found = estimate_horizon(boxes, FRAME)
+    assert found.horizon == pytest.approx(405 / 720, abs=0.01)
+    assert found.camera_height_m == pytest.approx(1.35, abs=0.05)
+    assert 0.008 < found.horizon_std < 0.05
+
+
+def test_boxes_without_a_common_line_give_an_uncertain_horizon():
+    corners = np.random.default_rng(0).uniform((50, 50), (1100, 600), (30, 2))
+    boxes = np.hstack([corners, corners + np.array([70, 50])])
+    assert estimate_horizon(boxes, FRAME).horizon_std > 0.05
+
+
+def test_truncated_boxes_are_ignored():
+    boxes = boxes_on_a_road(0.5, 1.3, 20)
+    truncated = np.tile([[0.0, 300.0, 400.0, 720.0]], (30, 1))
+    found = estimate_horizon(np.concatenate([boxes, truncated]), FRAME)
+    assert found == estimate_horizon(boxes, FRAME)
+    assert found.n_boxes == 20
+
+
+def test_too_few_boxes_are_rejected():
+    with pytest.raises(InvalidInputError, match=r"^boxes must contain 4 vehicles .* got 3; use more frames"):
+        estimate_horizon(boxes_on_a_road(0.5, 1.3, 3), FRAME)

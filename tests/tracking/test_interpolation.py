@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vehicle_detection.tracking import Track, backfill_tracks, interpolate_tracks
+from vehicle_detection.tracking import Track
+from vehicle_detection.tracking.interpolation import backfill_tracks, interpolate_tracks
 
 SHAPE = (720, 1280, 3)
 

@@ -83,7 +83,7 @@ def test_frames_are_scored_like_the_detector(patch_set, frames, labels):
     classifier = train_classifier(train.patches, train.labels, params=PARAMS, options=TrainingOptions(C=0.1))
     scores = []
     for each in (frames, other):
-        with VehicleDetector(classifier, search_params=SEARCH, horizon=each.horizon) as detector:
+        with VehicleDetector(classifier, search_params=SEARCH.with_horizon(each.horizon)) as detector:
             found = TrackTable.from_detections({key: detector.detect(image) for key, image in each})
         scores.append(evaluate_detections(found, each.labels, frames=each.keys))
     assert row["frame_f1"] == pytest.approx(np.nanmean([score.f1 for score in scores]))

@@ -26,7 +26,7 @@ def clip(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def detector():
-    with VehicleDetector(random_network(), n_jobs=1, every=2) as detector:
+    with VehicleDetector(random_network(), jobs=1) as detector:
         yield detector
 
 
@@ -92,7 +92,7 @@ def test_closing_it_early_leaves_no_process(clip, detector, end):
 
 
 def test_options_and_ranges(clip):
-    with VehicleDetector(random_network(), n_jobs=1) as detector:
+    with VehicleDetector(random_network(), jobs=1) as detector:
         times = [result.time for result in track(clip, detector, start=0.1, end=0.3, every=1)]
     with read_frames(clip, start=0.1, end=0.3) as frames:
         assert times == [time for _, time, _ in frames]

@@ -8,13 +8,12 @@ import sys
 import threading
 import time
 import weakref
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.helpers import Result, StubDetector, start_interruptible
+from tests.helpers import StubDetector, start_interruptible
 from tests.video.clips import (
     LEVELS,
     NTSC,
@@ -25,8 +24,18 @@ from tests.video.clips import (
     running_threads,
     write_clip,
 )
+from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError, VideoError
-from vehicle_detection.video import FrameSource, open_source, probe_video, process_video, track, writing
+from vehicle_detection.tracking import FrameResult, Track, TrackParams, interpolate_results
+from vehicle_detection.video import (
+    FrameSource,
+    engine,
+    open_source,
+    probe_video,
+    process_video,
+    track,
+    writing,
+)
 from vehicle_detection.video.engine import _QueuedFrame
 
 
@@ -210,56 +219,61 @@ def test_an_interrupt_at_any_time_leaves_no_file_and_no_process(clip, tmp_path):
 
 
 class IntervalStub(StubDetector):
-    """Searches every n-th frame, and interpolates the brightness of the others."""
+    """Need not search every frame; its results have no tracks to interpolate."""
 
-    def __init__(self, interval):
+    searches_every_frame = False
+
+    def __init__(self):
         super().__init__()
-        self.interval, self.searched, self.skipped = interval, [], []
-
-    def search_interval(self, fps):
-        assert fps > 0
-        return self.interval
+        self.searched, self.steps = [], []
 
     def search(self, frame):
         found = super().search(frame)
         self.searched.append(round((found - 10) / LEVELS))
         return found
 
-    def skip(self, thumbnail):
-        self.skipped.append(round((float(thumbnail.mean()) - 10) / LEVELS))
-        self.index += 1
-
-    def interpolate(self, before, after, times):
-        last = before.brightness if after is None else after.brightness
-        mean = (before.brightness + last) / 2
-        return [Result(before.index + 1 + number, mean, time) for number, time in enumerate(times)]
+    def track(self, found, *, time, frames, cut):
+        self.steps.append((frames, cut))
+        result = super().track(found, time=time, frames=frames, cut=cut)
+        return FrameResult(result.index, time, Detections.empty(), Detections.empty(), ())
 
 
 @pytest.mark.parametrize("workers", [1, 3])
 @pytest.mark.parametrize("interval", [1, 2, 3, 50])
 def test_frames_between_the_searched_ones_are_interpolated(clip, tmp_path, interval, workers):
     target, results = tmp_path / "out.mp4", []
-    detector = IntervalStub(interval)
-    report = process_video(clip, target, detector, workers=workers, on_result=results.append)
+    detector = IntervalStub()
+    report = process_video(clip, target, detector, every=interval, workers=workers, on_result=results.append)
     frames = report.frames
     assert sorted(detector.searched) == list(range(0, frames, interval))
-    assert detector.skipped == [n for n in range(max(detector.searched)) if n % interval]
+    assert detector.steps == [(1, False)] + [(interval, False)] * (len(detector.searched) - 1)
     assert [result.index for result in results] == list(range(frames))
     assert [result.time for result in results] == pytest.approx(np.arange(frames) / float(NTSC))
     assert frame_numbers(target) == list(range(frames))
-    if interval == 2:
-        assert results[1].brightness == (results[0].brightness + results[2].brightness) / 2
+    assert [result.searched for result in results] == [n % interval == 0 for n in range(frames)]
+
+
+@pytest.mark.parametrize(("fps", "interval"), [(10, 1), (NTSC, 2), (60, 5)])
+def test_a_video_is_searched_twelve_times_a_second(tmp_path, fps, interval):
+    source, detector = write_clip(tmp_path / "clip.mp4", gray_frames(11), fps=fps), IntervalStub()
+    process_video(source, None, detector)
+    assert sorted(detector.searched) == list(range(0, 11, interval))
+    detector.searched.clear()
+    detector.searches_every_frame = True
+    process_video(source, None, detector)
+    assert sorted(detector.searched) == list(range(11))
 
 
 def test_the_first_frame_of_a_scene_is_searched(tmp_path):
     frames = [np.full((48, 64, 3), level, np.uint8) for level in [20] * 4 + [200] * 3 + [20] * 4]
-    detector = IntervalStub(3)
+    detector = IntervalStub()
     detector.search = lambda frame: detector.searched.append(int(frame.mean())) or float(frame.mean())
     results = []
     source = write_clip(tmp_path / "cuts.mp4", frames)
-    process_video(source, None, detector, workers=1, on_result=results.append)
+    process_video(source, None, detector, workers=1, every=3, on_result=results.append)
     # Frames 0 and 3; the cuts at 4 and 7; and 10.
     assert [round(level, -1) for level in detector.searched] == [20, 20, 200, 20, 20]
+    assert [cut for _, cut in detector.steps] == [False, False, True, True, False]
     assert [result.index for result in results] == list(range(11))
 
 
@@ -271,47 +285,33 @@ def test_a_stop_before_the_first_frame_ends_the_run(clip):
 
 
 class DelayedDetector(StubDetector):
-    """Holds three searched frames back, and marks the results that it saw again."""
+    """Confirms its track in the fourth searched frame, and lets a run hold three back."""
 
-    def search_interval(self, fps):
-        return 2
+    track_params = TrackParams(backfill=0.21)  # 3.1 searched frames
 
-    def search_delay(self, fps):
-        return 3
-
-    def skip(self, thumbnail):
-        self.index += 1
-
-    def interpolate(self, before, after, times):
-        self.between.append((self.seen[before.index], after and self.seen[after.index]))
-        return [Result(before.index + 1, before.brightness, time, before.tracks) for time in times]
-
-    def reset(self, *, fps):
-        super().reset(fps=fps)
-        self.between, self.seen = [], Counter()
-
-    def backfill(self, results):
-        self.seen.update(result.index for result in results)
-        return results
+    def track(self, found, *, time, frames, cut):
+        index = super().track(found, time=time, frames=frames, cut=cut).index
+        number = int(index >= 6)
+        state = "confirmed" if number else "tentative"
+        track = Track(
+            id=number, key=1, box=np.array([5.0, 5, 9, 9]), score=1.0, state=state, shown=bool(number),
+            age=time, misses=0, time_since_update=0.0, velocity=(0.0, 0.0),
+        )  # fmt: skip
+        return FrameResult(index, time, Detections.empty(), Detections.empty(), (track,))
 
 
-def test_searched_frames_are_held_back(clip, tmp_path):
-    detector, results = DelayedDetector(), []
-    process_video(clip, tmp_path / "out.mp4", detector, on_result=results.append)
-    assert [result.index for result in results] == list(range(len(frame_numbers(clip))))
-    seen = [detector.seen[result.index] for result in results[::2]]
-    # Each one is seen once when it is tracked, and with each of the three after it.
-    assert seen == [4] * (len(seen) - 3) + [3, 2, 1]
-    assert detector.between[0] == (4, 4)
+def test_searched_frames_are_held_back_for_tracks_that_are_confirmed_later(clip):
+    with track(clip, DelayedDetector(), every=2) as results:
+        shown = [len(result.shown) for result in results]
+    assert shown == [1] * 20
 
 
 def test_live_sources_are_not_delayed(tmp_path, monkeypatch):
-    detector, results = DelayedDetector(), []
     source = write_clip(tmp_path / "clip.mp4", gray_frames(8))
     monkeypatch.setattr(FrameSource, "live", True)
-    process_video(source, None, detector, on_result=results.append)
-    assert len(results) == 8
-    assert not detector.seen
+    with track(source, DelayedDetector(), every=2) as results:
+        shown = [len(result.shown) for result in results]
+    assert shown == [0] * 5 + [1] * 3
 
 
 def test_a_run_that_ends_before_its_first_frame_keeps_the_target(clip, tmp_path):
@@ -331,24 +331,16 @@ def test_a_run_that_ends_before_its_first_frame_keeps_the_target(clip, tmp_path)
 
 
 @pytest.mark.parametrize("draw", [True, False])
-def test_frames_that_are_not_searched_are_kept_only_to_be_drawn(clip, tmp_path, draw):
-    class Sparse(StubDetector):
-        """Searches the first frame only."""
+def test_frames_that_are_not_searched_are_kept_only_to_be_drawn(clip, tmp_path, monkeypatch, draw):
+    alive = 0
 
-        alive = 0
+    def count(*arguments):
+        nonlocal alive
+        frames = [each for each in gc.get_objects() if type(each) is _QueuedFrame]
+        alive = sum(each.frame is not None for each in frames)
+        return interpolate_results(*arguments)
 
-        def search_interval(self, fps):
-            return 1000
-
-        def skip(self, thumbnail):
-            pass
-
-        def interpolate(self, before, after, times):
-            frames = [each for each in gc.get_objects() if type(each) is _QueuedFrame]
-            self.alive = sum(each.frame is not None for each in frames)
-            return [Result(before.index + 1 + number, 0.0, time) for number, time in enumerate(times)]
-
-    detector = Sparse()
-    report = process_video(clip, tmp_path / "out.mp4" if draw else None, detector)
+    monkeypatch.setattr(engine, "interpolate_results", count)
+    report = process_video(clip, tmp_path / "out.mp4" if draw else None, IntervalStub(), every=1000)
     assert report.frames == 20
-    assert detector.alive == (19 if draw else 0)
+    assert alive == (19 if draw else 0)

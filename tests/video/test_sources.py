@@ -281,12 +281,6 @@ def test_a_live_source_drops_frames_rather_than_lag(tmp_path, monkeypatch):
                 time.sleep(0.005)
             return super().search(frame)
 
-        def search_interval(self, fps):
-            return 1
-
-        def skip(self, thumbnail):
-            self.index += 1
-
     results = []
     with endless_pipe(tmp_path / "pipe"), open_source(tmp_path / "pipe", live=True) as source:
         report = process_video(

@@ -74,8 +74,8 @@ class BatchOptions:
             "conf": self.conf,
             "horizon": self.horizon,
             "camera": self.camera,
-            "field_of_view": self.fov,
-            "camera_height_m": self.camera_height,
+            "fov": self.fov,
+            "camera_height": self.camera_height,
             "every": self.every,
             "blur": self.blur,
         }
@@ -86,8 +86,7 @@ class BatchOptions:
     out="--output",
     retry_failed="--retry-failed",
     dry_run="--dry-run",
-    field_of_view="--fov",
-    camera_height_m="--camera-height",
+    height_m="--camera-height",
 )
 @takes(BatchOptions)
 def batch(options: BatchOptions) -> None:

@@ -45,10 +45,11 @@ def demo(
     Oncoming vehicles are scored too; boxes on vehicles that are under 40 pixels wide or largely hidden are
     neither right nor wrong.
     """
+    from vehicle_detection.camera import Camera
     from vehicle_detection.detector import VehicleDetector
 
     # The field of view of the rendering camera.
-    with output_folder(output, "--output"), VehicleDetector(field_of_view=58) as detector:
+    with output_folder(output, "--output"), VehicleDetector(camera=Camera.dashcam(fov=58)) as detector:
         done, scores = _run(output, detector, frames=frames, random_state=seed, report=report)
     print_facts(
         f"{scores.frames} rendered frames of 1280x720, {scores.vehicles} vehicles, {scores.tracks} tracks",
@@ -82,7 +83,7 @@ def _run(
         page = ReportWriter(temporary / REPORT, video=annotated, source=clip, detector=detector)
         draw_clip(drive, clip, labels, progress=True)
         # Compile the kernels now, so that the reported speed does not include it.
-        detector.warm_up(drive.shape)
+        detector.detect(np.zeros((*drive.shape, 3), np.uint8))
         with open_tracks(tracks) as write:
             writers: list[Callable[[Any], object]] = [write, page]
             done = process_video(

@@ -30,7 +30,7 @@ from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from vehicle_detection.boxes import Detections
-    from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.detector import Detector
 
 _CHECKED_IMAGES = 20  # images that are searched again if no vehicle was found
 
@@ -66,7 +66,8 @@ def detect(options: DetectOptions) -> None:
     Exit code 3: some images cannot be decoded, and are left out.
     """
     from vehicle_detection._common import encodable
-    from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.camera import Camera
+    from vehicle_detection.detector import Detector
     from vehicle_detection.formats import write_tracks
     from vehicle_detection.tables import TrackTable
 
@@ -75,7 +76,7 @@ def detect(options: DetectOptions) -> None:
     left_out: list[Path] = []
     loaded = open_model(options.model, options.classes, options.device)
     with (
-        VehicleDetector(loaded, conf=options.conf, horizon=options.horizon) as detector,
+        Detector(loaded, conf=options.conf, camera=Camera.dashcam(horizon=options.horizon)) as detector,
         output_folder(options.output, "--output"),
         output_folder(options.why, "--why"),
     ):
@@ -144,7 +145,7 @@ def _check(options: DetectOptions, images: list[Path]) -> None:
 
 
 def _detect_each(
-    images: list[Path], detector: VehicleDetector, options: DetectOptions, left_out: list[Path]
+    images: list[Path], detector: Detector, options: DetectOptions, left_out: list[Path]
 ) -> Iterator[tuple[str, Detections]]:
     """Detect the vehicles of each image, print them, and write what the options name.
 
@@ -215,11 +216,11 @@ def _write_annotated(folder: Path, path: Path, image: Any, found: Detections, op
 
 
 def _write_explanations(
-    folder: Path, name: str, detector: VehicleDetector, image: Any, shown: Any, found: Detections
+    folder: Path, name: str, detector: Detector, image: Any, shown: Any, found: Detections
 ) -> None:
     """Write a picture for each box of an image that says why it was found; it shows the image `shown`."""
     from vehicle_detection._common import atomic_write
-    from vehicle_detection.explanation import explain
+    from vehicle_detection.evaluation import explain
     from vehicle_detection.notebook import plot_explanation
 
     for number, box in enumerate(found.boxes, start=1):
@@ -231,13 +232,13 @@ def _write_explanations(
 
 
 def _warn_if_empty(
-    found: Iterator[tuple[str, Detections]], images: Iterator[Path], detector: VehicleDetector, horizon: float
+    found: Iterator[tuple[str, Detections]], images: Iterator[Path], detector: Detector, horizon: float
 ) -> Iterator[tuple[str, Detections]]:
     """Pass on what is found; if that is nothing, search some images without the given horizon."""
     import numpy as np
 
-    from vehicle_detection.camera import estimate_horizon
     from vehicle_detection.images import read_image
+    from vehicle_detection.tracking import estimate_horizon
 
     total = 0
     for name, vehicles in found:

@@ -8,21 +8,28 @@ from vehicle_detection.cli.output import print_error, print_line
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from vehicle_detection.camera import HorizonEstimate
-    from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.detector import Detector
+    from vehicle_detection.tracking import HorizonEstimate
     from vehicle_detection.video import FrameSource
 
 
-def search_everywhere(model: Any, conf: float | None) -> VehicleDetector:
+def search_everywhere(model: Any, conf: float | None) -> Detector:
     """Open a detector that searches all rows, whatever the horizon."""
-    from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.detector import Detector
 
-    return VehicleDetector(model, conf=conf, search_params=model.search_params_type.default().everywhere())
+    params = model.search_params_type.default()
+    return Detector(model, conf=conf, search_params=params.everywhere() if _has_bands(params) else None)
 
 
-def is_limited(detector: VehicleDetector) -> bool:
-    """Whether the detector searches rows near the horizon only; networks and functions search all."""
-    return detector.search_params != detector.search_params.everywhere()
+def _has_bands(params: Any) -> bool:
+    """Whether a search is of bands below the horizon; networks and functions search all rows."""
+    return hasattr(params, "everywhere")
+
+
+def is_limited(detector: Detector) -> bool:
+    """Whether the detector searches rows near the horizon only."""
+    params = detector.search_params
+    return _has_bands(params) and params != params.everywhere()
 
 
 def warn_of_horizon(given: str, found: HorizonEstimate | None) -> None:

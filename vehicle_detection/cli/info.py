@@ -22,7 +22,7 @@ def info(
     ),
 ) -> None:
     """Show a model's parameters, accuracy, training data and versions."""
-    from vehicle_detection.loading import load_model
+    from vehicle_detection.detector import load_model
 
     loaded = load_model(model)
     title, facts = loaded.summary()

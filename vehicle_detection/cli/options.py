@@ -127,7 +127,7 @@ def parse_classes(text: str | None) -> list[str | int] | None:
 
 def open_model(name: str, classes: str | None, device: Any) -> Any:
     """Load the model that the options name."""
-    from vehicle_detection.loading import load_model
+    from vehicle_detection.detector import load_model
 
     return load_model(name, classes=parse_classes(classes), device=device)
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from vehicle_detection.video import FrameSource, VideoReport
 
 
-@option_names(target="--output", workers="--jobs", field_of_view="--fov", camera_height_m="--camera-height")
+@option_names(target="--output", workers="--jobs", height_m="--camera-height")
 @takes(VideoOptions)
 def video(options: VideoOptions) -> None:
     """Track the vehicles of a video, and write or show an annotated copy.
@@ -46,7 +46,8 @@ def video(options: VideoOptions) -> None:
     outputs = SideOutputs(options)
     files = options.files().values()
     run: dict[str, Any] = options.span() | {
-        "preset": options.preset, "workers": options.jobs, "audio": not options.no_audio
+        "preset": options.preset, "workers": options.jobs, "audio": not options.no_audio,
+        "every": options.every,
     }  # fmt: skip
     with (
         name_kept_files(files),
@@ -133,21 +134,21 @@ def _check(options: VideoOptions) -> None:
 @contextlib.contextmanager
 def _open(options: VideoOptions) -> Iterator[tuple[FrameSource, VehicleDetector]]:
     """Open the source and the detector; its horizon is estimated first if the option says so."""
+    from vehicle_detection.annotator import Annotator
+    from vehicle_detection.camera import open_camera
     from vehicle_detection.cli.video_outputs import read_speed
     from vehicle_detection.detector import VehicleDetector
 
-    settings: dict[str, Any] = {
-        "conf": options.conf,
-        "camera": options.camera,
-        "field_of_view": options.fov,
-        "camera_height_m": options.camera_height,
-        "every": options.every,
-        "own_speed": read_speed(options.own_speed, options.gpx, options.gpx_offset),
-        "diagnostics": options.diagnostics,
-        "draw_params": options.draw_params(),
-        "blur": options.blur,
-    }
-    horizon = options.stated_horizon()
+    region: Any = options.blur
+    annotator = Annotator(
+        options.draw_params(),
+        own_speed=read_speed(options.own_speed, options.gpx, options.gpx_offset),
+        diagnostics=options.diagnostics,
+        blur=region,
+    )
+    camera = open_camera(
+        options.camera, fov=options.fov, height_m=options.camera_height, horizon=options.stated_horizon()
+    )
     model = open_model(options.model, options.classes, options.device)
     with options.open_source() as source:
         if options.why and not source.rereadable:
@@ -156,11 +157,12 @@ def _open(options: VideoOptions) -> Iterator[tuple[FrameSource, VehicleDetector]
             )
         if options.horizon == "auto":
             # The estimate takes seconds: refuse invalid options before it.
-            with VehicleDetector(model, **settings) as unsure:
-                unsure.camera_of(source.info.shape)
+            with VehicleDetector(model, conf=options.conf, camera=camera, annotator=annotator) as unsure:
+                camera.for_shape(source.info.shape)
                 _check_run(options, source, unsure)
             horizon = find_horizon(source, model, conf=options.conf, quiet=options.quiet, **options.span())
-        with VehicleDetector(model, horizon=horizon, **settings) as detector:
+            camera = camera if horizon is None else camera.with_horizon(horizon)
+        with VehicleDetector(model, conf=options.conf, camera=camera, annotator=annotator) as detector:
             yield source, detector
 
 
@@ -171,14 +173,14 @@ def _warn_of_camera(
     from vehicle_detection.video import estimate_video_horizon
 
     if done.tracks:
-        if not detector.lens_is_known:
+        if not detector.camera.lens_is_known:
             print_error(UNKNOWN_LENS)
         return
-    if not source.rereadable or not is_limited(detector):
+    if not source.rereadable or not is_limited(detector.detector):
         return
     if options.stated_horizon() is not None:
         given = f"--horizon {options.horizon}"
-    elif options.horizon is None and detector.search_params_of(done.shape) != detector.search_params:
+    elif options.horizon is None and detector.camera.horizon_is_known:
         given = f"the horizon of --camera {options.camera}"
     else:
         return

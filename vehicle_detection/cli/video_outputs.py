@@ -88,7 +88,7 @@ class SideOutputs:
                     video=options.output,
                     source=options.source,
                     detector=detector,
-                    units=detector.draw_params.units,
+                    units=detector.annotator.style.units,
                 )
         self._table = self._page.table if self._page else TrackTable()
         # A camera that never ends would fill the memory with tracks that nobody asked for.
@@ -112,11 +112,10 @@ class SideOutputs:
             with option_names(path="--events"):
                 write_events(events, options.events)
         if options.srt is not None:
-            units = detector.draw_params.units
+            units = detector.annotator.style.units
             with option_names(path="--srt"):
-                write_subtitles(
-                    table, options.srt, fps=fps, events=events, own_speed=detector.own_speed, units=units
-                )
+                own = detector.annotator.own_speed
+                write_subtitles(table, options.srt, fps=fps, events=events, own_speed=own, units=units)
         if self._page is not None:
             pictures = self._explain(detector) if options.why else []
             self._page.finish(done, events=events, pictures=pictures)
@@ -132,15 +131,16 @@ class SideOutputs:
         from vehicle_detection.drive import find_events, own_speeds
 
         table, fps, speeds = self._table, float(done.fps), None
-        if detector.own_speed is not None:
-            speeds = own_speeds(detector.own_speed, table, fps=fps)
+        own = detector.annotator.own_speed
+        if own is not None:
+            speeds = own_speeds(own, table, fps=fps)
             unknown = float(np.isnan(speeds).mean()) if len(speeds) else 0.0
             if unknown > _MAX_UNKNOWN and not self._options.quiet:
                 print_error(
                     f"warning: the own speed is known for {1 - unknown:.0%} of the video; check "
                     "--gpx-offset, and that the file has no gaps of over 5 s"
                 )
-        camera = detector.camera_of(done.shape)
+        camera = detector.camera.for_shape(done.shape)
         return find_events(table, fps=fps, shape=done.shape, camera=camera, own_speed_mps=speeds)
 
     def _explain(self, detector: VehicleDetector) -> list[TrackPicture]:
@@ -148,7 +148,7 @@ class SideOutputs:
         from vehicle_detection.drive import explain_tracks
 
         with self._options.open_source() as source:
-            return explain_tracks(detector, source, self._table)
+            return explain_tracks(detector, source, self._table, every=self._options.every)
 
     def print_summary(self, done: VideoReport) -> None:
         """Print the counts of a drive in one line, and the number of events of each other kind in another."""

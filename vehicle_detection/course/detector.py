@@ -16,6 +16,7 @@ from vehicle_detection._common import (
     check_type,
     describe,
 )
+from vehicle_detection.camera import Camera
 from vehicle_detection.course.features import or_default
 from vehicle_detection.course.search import find_car_windows
 from vehicle_detection.course.windows import draw_boxes
@@ -114,22 +115,23 @@ class HeatmapDetector(VehicleDetector):
             model = FunctionModel(
                 function=search_hits, score="logit", thread_safe=True, name="find_car_windows"
             )
-            super().__init__(model, region_params=heat.for_search(search), horizon=_HORIZON)
-        self._speed_warning = False
+            camera = Camera.dashcam(horizon=_HORIZON)
+            super().__init__(model, region_params=heat.for_search(search), camera=camera)
+        self._warned = True  # the course shows no speeds
 
     @property
     def heatmap(self) -> NDArray[np.float32] | None:
         """Mean number of hits per pixel over the last frames, ``(H, W)``; None before the first frame."""
-        return None if self._heat is None else self._heat.copy()
+        return None if self.heat is None else self.heat.copy()
 
     @property
     def labels(self) -> tuple[NDArray[np.int32], int]:
         """Label array ``(H, W)`` of the regions above the threshold, and their number."""
         from scipy.ndimage import label
 
-        if self._heat is None or self._heat_params is None:
+        if self.heat is None or self.detector.heat_params is None:
             raise InvalidInputError("labels need a frame; call the detector with one first")
-        array, count = label(self._heat > heat_threshold(self._heat_params), structure=np.ones((3, 3)))
+        array, count = label(self.heat > heat_threshold(self.detector.heat_params), structure=np.ones((3, 3)))
         return array, count
 
     def annotate(self, frame: NDArray[np.uint8], result: FrameResult) -> NDArray[np.uint8]:
@@ -142,7 +144,7 @@ class HeatmapDetector(VehicleDetector):
         frame, result
             As in `VehicleDetector.annotate`.
         """
-        if self.diagnostics:
+        if self.annotator.diagnostics:
             return super().annotate(frame, result)
         check_type(result, "result", FrameResult, "pass what process or track returns")
         return draw_boxes(frame, result.detections)

@@ -31,7 +31,6 @@ from vehicle_detection._common import (
     pluralize,
     progress_bar,
 )
-from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drive.batch_plan import (
     fingerprint_of,
     group_files,
@@ -52,7 +51,14 @@ from vehicle_detection.drive.batch_records import (
     write_record,
 )
 from vehicle_detection.drive.batch_store import Store, open_store
-from vehicle_detection.drive.batch_trip import BUSY, RECORDED, remove_replaced, run_trip, warm_up
+from vehicle_detection.drive.batch_trip import (
+    BUSY,
+    RECORDED,
+    open_detector,
+    remove_replaced,
+    run_trip,
+    warm_up,
+)
 from vehicle_detection.drive.trips import Trip, find_trips
 from vehicle_detection.drive.worker_pool import WorkerPool
 from vehicle_detection.errors import InvalidInputError
@@ -164,7 +170,8 @@ def run_batch(
     model
         A model's name or file.
     options
-        Further arguments of `VehicleDetector` as JSON values, such as ``{"horizon": 0.55, "every": 2}``.
+        Options of the command ``batch`` for the detector as JSON values: classes, device, conf, camera, fov,
+        camera_height, horizon, every and blur, such as ``{"horizon": 0.55, "every": 2}``.
     jobs
         Number of worker processes with one thread each; None: one per core.
     shard
@@ -298,9 +305,12 @@ def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -
             f"options must hold numbers, strings, lists and None, got {describe(options)}; {error}"
         ) from None
     try:
-        VehicleDetector(name, n_jobs=1, **given).close()  # an error now, not in every worker
+        open_detector(name, **given).close()  # an error now, not in every worker
     except TypeError as error:
-        raise InvalidInputError(f"options must be arguments of VehicleDetector; {error}") from None
+        raise InvalidInputError(
+            "options must be classes, device, conf, camera, fov, camera_height, horizon, every or blur; "
+            f"{error}"
+        ) from None
     return settings
 
 

@@ -7,14 +7,18 @@ import platform
 import tempfile
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
 
 from vehicle_detection import __version__
-from vehicle_detection._common import ParquetRows, hide_credentials, is_url, temporary_folder
-from vehicle_detection.detector import VehicleDetector
+from vehicle_detection._common import ParquetRows, check_integer, hide_credentials, is_url, temporary_folder
+from vehicle_detection.annotator import Annotator
+from vehicle_detection.camera import open_camera
+from vehicle_detection.detector import VehicleDetector, load_model
 from vehicle_detection.drive.batch_plan import fingerprint_of
 from vehicle_detection.drive.batch_records import (
     DONE,
@@ -34,6 +38,7 @@ from vehicle_detection.errors import (
     VideoError,
 )
 from vehicle_detection.formats import DIGITS, track_records
+from vehicle_detection.network import Device
 from vehicle_detection.video import FrameSource, download, open_source, process_video
 
 BUSY = "busy"
@@ -50,10 +55,34 @@ _COLUMNS = {
 
 def warm_up(settings: dict[str, Any], fingerprint: str) -> None:
     """Load the model and compile the kernels in this process."""
-    _detector(settings, fingerprint).warm_up((180, 320))
+    _detector(settings, fingerprint).detect(np.zeros((180, 320, 3), np.uint8))
 
 
 _of_thread = threading.local()
+
+
+def open_detector(
+    model: str,
+    *,
+    classes: Collection[str | int] | None = None,
+    device: Device = "cpu",
+    conf: float | None = None,
+    camera: str | None = None,
+    fov: float | None = None,
+    camera_height: float | None = None,
+    horizon: float | None = None,
+    every: int | None = None,
+    blur: Literal["vehicles", "plates"] | None = None,
+) -> VehicleDetector:
+    """Open the detector of a model and the options of a batch, of which `every` is that of the video."""
+    check_integer(every or 1, "every", low=1, high=1000)
+    return VehicleDetector(
+        load_model(model, classes=classes, device=device),
+        conf=conf,
+        camera=open_camera(camera, fov=fov, height_m=camera_height, horizon=horizon),
+        annotator=Annotator(blur=blur),
+        jobs=1,
+    )
 
 
 def _detector(settings: Mapping[str, Any], fingerprint: str) -> VehicleDetector:
@@ -65,7 +94,7 @@ def _detector(settings: Mapping[str, Any], fingerprint: str) -> VehicleDetector:
                 f"the file of the model {settings['model']}, or of the camera, is not the one with which the "
                 "batch was started; copy the same file to all machines, and start the batch again"
             )
-        _of_thread.detector, _of_thread.wanted = VehicleDetector(wanted[0], n_jobs=1, **wanted[1]), wanted
+        _of_thread.detector, _of_thread.wanted = open_detector(wanted[0], **wanted[1]), wanted
     detector: VehicleDetector = _of_thread.detector
     return detector
 
@@ -149,6 +178,7 @@ def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
                     audio=settings["audio"],
                     preset=settings["preset"],
                     workers=1,
+                    every=settings["options"].get("every"),
                     progress=False,
                     on_result=write,
                 )

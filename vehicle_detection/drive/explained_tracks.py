@@ -12,8 +12,9 @@ from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import blur_boxes, draw_boxes, draw_cell_shares
 from vehicle_detection.drive.history import track_histories
 from vehicle_detection.drive.report_page import TrackPicture
-from vehicle_detection.explanation import Explanation, explain
+from vehicle_detection.evaluation import Explanation, explain
 from vehicle_detection.tables import TrackTable
+from vehicle_detection.tracking import search_interval
 from vehicle_detection.video import Source, borrow_source
 
 # Part of an image around a window that a picture shows, as a fraction of its longer side; height of the
@@ -23,13 +24,17 @@ _AROUND, _PICTURE_HEIGHT, _BOX_COLOR = 0.2, 180, (240, 228, 66)
 _MAX_EXPLAINED = 12
 
 
-def explain_tracks(detector: VehicleDetector, source: Source, table: TrackTable) -> list[TrackPicture]:
+def explain_tracks(
+    detector: VehicleDetector, source: Source, table: TrackTable, *, every: int | None = None
+) -> list[TrackPicture]:
     """Explain a box of each of the twelve longest tracks: the largest detected one inside the frame.
 
     Parameters
     ----------
     detector, source, table
         The detector, a source that can be read again, and the tracks of its frames.
+    every
+        As in `process_video`, with which the tracks were found.
 
     Returns
     -------
@@ -49,7 +54,8 @@ def explain_tracks(detector: VehicleDetector, source: Source, table: TrackTable)
     with borrow_source(source) as opened:
         shape = opened.info.shape[:2]
         fps = float(opened.info.fps)
-        offset, interval = round((table.first_time or 0.0) * fps), detector.search_interval(fps)
+        offset = round((table.first_time or 0.0) * fps)
+        interval = every or (1 if detector.searches_every_frame else search_interval(fps))
         for track in tracks:
             truncated = truncated_edges(track.boxes, shape).any(axis=1)
             # Predicted boxes have no detection to explain; they are the last choice.
@@ -69,9 +75,9 @@ def _draw_explanation(
     detector: VehicleDetector, image: NDArray[np.uint8], explanation: Explanation
 ) -> NDArray[np.uint8]:
     """Draw an explained box twice, side by side: as it is, and with the shares of its cells."""
-    if detector.blur is not None:
+    if detector.annotator.blur is not None:
         boxes = np.concatenate([detector.detect(image).boxes, explanation.box[None]])
-        image = blur_boxes(image, boxes, region=detector.blur)
+        image = blur_boxes(image, boxes, region=detector.annotator.blur)
     both = np.stack([explanation.window, explanation.box])
     around = _AROUND * (both[:, 2:].max(axis=0) - both[:, :2].min(axis=0)).max()
     low, high = both[:, :2].min(axis=0) - around, both[:, 2:].max(axis=0) + around

@@ -21,6 +21,7 @@ from vehicle_detection._common import (
     hide_credentials,
     is_url,
 )
+from vehicle_detection.camera import Camera
 from vehicle_detection.drive.events import Event, check_events, find_events
 from vehicle_detection.drive.own_speed import own_speeds
 from vehicle_detection.drive.report_page import TrackPicture, VideoEmbed, render_page
@@ -125,9 +126,9 @@ class ReportWriter:
         """
         check_type(report, "report", VideoReport, "pass what process_video returned")
         if events is None:
-            camera_of = getattr(self._detector, "camera_of", lambda shape: None)
-            camera, fps = camera_of(report.shape), float(report.fps)
-            own = getattr(self._detector, "own_speed", None)
+            camera, fps = getattr(self._detector, "camera", None), float(report.fps)
+            camera = camera.for_shape(report.shape) if isinstance(camera, Camera) else None
+            own = getattr(getattr(self._detector, "annotator", None), "own_speed", None)
             speeds = None if own is None else own_speeds(own, self.table, fps=fps)
             events = find_events(self.table, fps=fps, shape=report.shape, camera=camera, own_speed_mps=speeds)
         listed = check_sequence(pictures, "pictures", "TrackPicture")

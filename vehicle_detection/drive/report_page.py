@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 import vehicle_detection
 from vehicle_detection._common import ROUGH_DISTANCE, UNITS, Floats, Units, format_with_error, pluralize
 from vehicle_detection.annotator import MAX_SPEED_STD
+from vehicle_detection.camera import Camera
 from vehicle_detection.drive.counts import VehicleCounts, count_vehicles
 from vehicle_detection.drive.events import KINDS, Event
 from vehicle_detection.drive.history import TrackHistory, bin_means, track_histories
@@ -119,7 +120,8 @@ def render_page(
     axis = TimeAxis(max(report.frames, len(table.counts()), 1), float(report.fps))
     chosen = UNITS[units]
     # Labels in the video state speeds over ground where the own speed is known.
-    relative = " relative" if getattr(detector, "own_speed", None) is not None else ""
+    own = getattr(getattr(detector, "annotator", None), "own_speed", None)
+    relative = " relative" if own is not None else ""
     tracks = [_in_units(_without_imprecise_speeds(track), chosen) for track in track_histories(table)]
     css, script, template = map(_read, ("report.css", "report.js", "report.html.j2"))
     environment = Environment(
@@ -178,7 +180,8 @@ def _notices(tracks: Sequence[TrackHistory], report: VideoReport, detector: Any)
         verb = "was" if report.dropped == 1 else "were"
         notices.append(f"{pluralize(report.dropped, 'frame')} of the live source {verb} dropped.")
     measured = any(np.isfinite(track.columns["distance_m"]).any() for track in tracks)
-    if measured and not getattr(detector, "lens_is_known", True):
+    camera = getattr(detector, "camera", None)
+    if measured and isinstance(camera, Camera) and not camera.lens_is_known:
         notices.append("The lens is unknown: distances and speeds may be wrong by a factor of 2 or more.")
     return notices
 
@@ -307,21 +310,19 @@ def _script_data(tracks: Sequence[TrackHistory], axis: TimeAxis) -> dict[str, An
 
 def _settings(detector: Any, shape: tuple[int, ...]) -> list[Group]:
     """Parameters of a detector, a group for each dataclass of them."""
-    search, regions, tracks = (
-        getattr(detector, name, None) for name in ("search_params", "region_params", "track_params")
-    )
-    if hasattr(detector, "search_params_of"):
-        search = detector.search_params_of(shape)
+    part = getattr(detector, "detector", None)
+    search, regions = (getattr(part, name, None) for name in ("search_params", "region_params"))
     bands = getattr(search, "bands", ())
     groups = {"Search": search}
     if isinstance(regions, HeatParams):
         groups["Regions (heat map)"] = regions
     elif bands:  # without bands, the model itself predicts boxes
         groups["Regions (fitted boxes)"] = regions
-    groups["Tracks"] = tracks
-    if hasattr(detector, "camera_of"):
-        title = "Camera" if getattr(detector, "lens_is_known", False) else "Camera (assumed)"
-        groups[title] = detector.camera_of(shape)
+    groups["Tracks"] = getattr(detector, "track_params", None)
+    camera = getattr(detector, "camera", None)
+    if isinstance(camera, Camera):
+        title = "Camera" if camera.lens_is_known else "Camera (assumed)"
+        groups[title] = camera.for_shape(shape)
     found = []
     for title, params in groups.items():
         if dataclasses.is_dataclass(params):

@@ -8,6 +8,7 @@ from vehicle_detection.evaluation.detections import (
     evaluate_detections,
     precision_recall_curve,
 )
+from vehicle_detection.evaluation.explanation import Explanation, explain
 from vehicle_detection.evaluation.labelled_frames import Frames, LabelledFrames, keyed_frames
 from vehicle_detection.evaluation.matching import DetectionMatches, match_detections, prepare_evaluation
 from vehicle_detection.evaluation.tracks import TrackScores, evaluate_tracks
@@ -15,6 +16,7 @@ from vehicle_detection.evaluation.tracks import TrackScores, evaluate_tracks
 __all__ = [
     "DetectionMatches",
     "DetectionScores",
+    "Explanation",
     "Frames",
     "LabelledFrames",
     "Platt",
@@ -24,6 +26,7 @@ __all__ = [
     "calibration_error",
     "evaluate_detections",
     "evaluate_tracks",
+    "explain",
     "keyed_frames",
     "match_detections",
     "precision_recall_curve",

@@ -23,7 +23,7 @@ from vehicle_detection._common import (
     single_threaded_opencv,
     store_number,
 )
-from vehicle_detection.boxes import Detections, Platt, box_areas, greedy_nms
+from vehicle_detection.boxes import Detections, Platt, box_areas, greedy_nms, logit
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.network.inputs import InputFormat, Size
 from vehicle_detection.network.outputs import Candidates, OutputFormat
@@ -46,23 +46,17 @@ class NetworkParams(Checked):
     input_size
         Longer side of the network's input in pixels, a multiple of 32. Larger inputs show smaller vehicles
         and take more time. None: the size in the model file, 640 for the shipped network.
-    horizon
-        Row of the horizon as a fraction of the frame's height, for distances; None: estimated.
-    horizon_tolerance
-        Error of the horizon as a fraction of the frame's height; the default suits any dash-cam.
     min_score
         Minimum score of the boxes before suppression that count as positive windows, in log-odds above the
         model's threshold.
 
     Examples
     --------
-    >>> NetworkParams(input_size=960).with_horizon(0.55).horizon
-    0.55
+    >>> NetworkParams(input_size=960).input_size
+    960
     """
 
     input_size: int | None = integer(None, low=32, high=8192)
-    horizon: float | None = number(0.5, low=0, high=1, optional=True)
-    horizon_tolerance: float = number(0.15, low=0, high=1)
     min_score: float = number(0.0)
 
     def __post_init__(self) -> None:
@@ -77,16 +71,6 @@ class NetworkParams(Checked):
     def default(cls) -> NetworkParams:
         """Return the default parameters."""
         return cls()
-
-    def with_horizon(self, horizon: float | None) -> NetworkParams:
-        """Return the same parameters with a known horizon and a lower tolerance; None changes nothing."""
-        if horizon is None:
-            return self
-        return dataclasses.replace(self, horizon=horizon, horizon_tolerance=0.06)
-
-    def everywhere(self) -> NetworkParams:
-        """Return the same parameters: a network searches all rows."""
-        return self
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -119,7 +103,8 @@ class NetworkModel:
 
     Examples
     --------
-    >>> model = load_network("default")
+    >>> from vehicle_detection import load_model
+    >>> model = load_model("default")
     >>> model.input_size, model.classes
     (640, {0: 'vehicle'})
     """
@@ -155,12 +140,13 @@ class NetworkModel:
         """Probability that a box contains a vehicle, by its score: the log-odds above the threshold."""
         return Platt(-1.0, -self.threshold)
 
-    def open_search(self, n_jobs: int | None = None) -> NetworkSearch:
-        """Open a search of frames with this network: a thread-safe context manager, with `NetworkParams`.
+    def with_confidence(self, conf: float) -> NetworkModel:
+        """Return the model with the threshold at this probability."""
+        return dataclasses.replace(self, threshold=logit(conf))
 
-        `n_jobs` is the number of threads that share a frame.
-        """
-        return NetworkSearch(self, n_jobs=n_jobs)
+    def open_search(self, jobs: int | None = None) -> NetworkSearch:
+        """Open a search of frames with this network, of which several threads share a frame."""
+        return NetworkSearch(self, jobs)
 
     def __repr__(self) -> str:
         return f"NetworkModel({self.summary()[0]})"
@@ -217,8 +203,8 @@ class NetworkSearch(FrameSearch):
 
     params_type = NetworkParams
 
-    def __init__(self, model: NetworkModel, *, n_jobs: int | None = None) -> None:
-        super().__init__(n_jobs)
+    def __init__(self, model: NetworkModel, jobs: int | None = None) -> None:
+        super().__init__(jobs)
         self.model = model
         self._session: Session | None = None
         self._lock = threading.Lock()
@@ -269,7 +255,7 @@ class NetworkSearch(FrameSearch):
                 self._session = open_session(
                     model.graph,
                     model.name,
-                    n_jobs=self._team.n_threads,
+                    jobs=self._team.n_threads,
                     device=model.device,
                     runtime=model.runtime,
                 )

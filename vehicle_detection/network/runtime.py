@@ -61,7 +61,7 @@ def open_session(
     graph: bytes,
     name: str,
     *,
-    n_jobs: int | None = None,
+    jobs: int | None = None,
     device: Device = "cpu",
     runtime: Runtime = "auto",
 ) -> Session:
@@ -71,7 +71,7 @@ def open_session(
     ----------
     graph, name
         Content of an ONNX file, and how messages refer to it.
-    n_jobs
+    jobs
         Threads that share one run.
     device
         ``"cpu"`` or ``"cuda"``.
@@ -85,7 +85,7 @@ def open_session(
     InvalidInputError
         If the device or the library is not available.
     """
-    n_threads = resolve_jobs(n_jobs)
+    n_threads = resolve_jobs(jobs)
     check_device(device, runtime)
     if device == "cpu" and (runtime == "openvino" or (runtime == "auto" and _prefers_openvino())):
         return _OpenVinoSession(graph, name, n_threads)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vehicle_detection._common import check_image, check_type
-from vehicle_detection.explanation import Explanation
+from vehicle_detection.evaluation import Explanation
 from vehicle_detection.notebook import style
 from vehicle_detection.notebook.style import BLUE, VERMILION, YELLOW, FigureLike, Image
 

@@ -27,9 +27,9 @@ from vehicle_detection._common import (
     pluralize,
 )
 from vehicle_detection.boxes import Detections, box_areas
-from vehicle_detection.camera import Camera
+from vehicle_detection.camera import Camera, open_camera
 from vehicle_detection.datasets import FrameSet
-from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.detector import Detector, VehicleDetector
 from vehicle_detection.drawing import (
     TRACK_COLORS,
     blend,
@@ -39,7 +39,7 @@ from vehicle_detection.drawing import (
     heat_image,
 )
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
-from vehicle_detection.explanation import Explanation, explain
+from vehicle_detection.evaluation import Explanation, explain
 from vehicle_detection.heatmap import HeatParams, frame_heat, label_heat
 from vehicle_detection.images import read_image
 from vehicle_detection.network import NetworkModel, NetworkParams
@@ -100,7 +100,7 @@ class Explorer:
         ``(H, W, 3)`` uint8 RGB images or paths of image files, in a list or by name, or a `FrameSet`; and the
         width in pixels to which displayed images are reduced.
     model, search_params, region_params, camera, horizon
-        As in `VehicleDetector`.
+        As in `VehicleDetector`; `horizon` replaces that of the camera and of the search.
 
     Attributes
     ----------
@@ -135,11 +135,12 @@ class Explorer:
         width: int = 960,
     ) -> None:
         self._readers = _frame_readers(frames)
-        detector = VehicleDetector(
-            model, search_params=search_params, region_params=region_params, camera=camera, horizon=horizon
-        )
+        camera = open_camera(camera, horizon=horizon)
+        if isinstance(search_params, SearchParams):
+            search_params = search_params.with_horizon(horizon)
+        detector = Detector(model, search_params=search_params, region_params=region_params, camera=camera)
         self._width = check_integer(width, "width", low=16, high=10_000)
-        self._camera = camera
+        self.camera = detector.camera
         self._search = detector.model.open_search()
         self._read_frame = functools.lru_cache(_CACHED_FRAMES)(lambda name: self._readers[name]())
         self._search_frame = functools.lru_cache(_CACHED_SEARCHES)(self._search_frame_uncached)
@@ -149,11 +150,9 @@ class Explorer:
         self.frame = self.names[0]
         self.view: View = "windows"
         self.box = 0
-        # A camera file may state a horizon.
-        shape = None if camera is None else self._read_frame(self.frame).shape
-        self.search_params = detector.search_params if shape is None else detector.search_params_of(shape)
+        self.search_params = detector.search_params
         self.bands = tuple(range(len(self._all_bands)))
-        given = detector.region_params
+        given = region_params
         self.method: Method = "heat" if isinstance(given, HeatParams) else "groups"
         heat = given if isinstance(given, HeatParams) else HeatParams()
         self.heat_params = heat.for_search(self.search_params)
@@ -202,7 +201,10 @@ class Explorer:
         `horizon` a fraction of the frame's height, and `bands` are the numbers of the bands of
         ``search_params.bands`` to search, from 0; an empty list finds nothing.
         """
-        params = self.search_params.with_horizon(horizon)
+        params, camera = self.search_params, self.camera
+        if horizon is not None:
+            camera = camera.with_horizon(horizon)
+            params = params.with_horizon(horizon) if self._all_bands else params
         if min_score is not None:
             params = dataclasses.replace(params, min_score=min_score)
         if bands is not None:
@@ -211,7 +213,7 @@ class Explorer:
             last = len(self._all_bands) - 1
             given = check_sequence(bands, "bands", "band numbers")
             self.bands = tuple(sorted({check_integer(band, "bands", low=0, high=last) for band in given}))
-        self.search_params = params
+        self.search_params, self.camera = params, camera
 
     def set_regions(
         self,
@@ -258,11 +260,7 @@ class Explorer:
         vehicles = self._find().vehicles
         if vehicles is None:
             shape = self._read_frame(self.frame).shape
-            with VehicleDetector(
-                self.model, search_params=self.search_params, camera=self._camera
-            ) as detector:
-                camera = detector.camera_of(shape)
-            vehicles = find_vehicles(self.windows(), camera, shape, self.group_params)
+            vehicles = find_vehicles(self.windows(), self.camera, shape, self.group_params)
         confidences = self.model.calibration.probability(vehicles.scores)
         return Detections(vehicles.boxes, vehicles.scores, confidences)
 
@@ -299,16 +297,19 @@ class Explorer:
     def detector(self, **options: Any) -> VehicleDetector:
         """Create a detector with the current parameters, for a script or a video.
 
-        `options` are further arguments of `VehicleDetector`, such as ``field_of_view``. An
-        `InvalidInputError` is raised if no band is selected.
+        `options` are further arguments of `VehicleDetector`, such as ``camera``, which gets the current
+        horizon. An `InvalidInputError` is raised if no band is selected.
         """
         params: Any = self.search_params
         if self._all_bands:
             params = dataclasses.replace(
                 params, bands=tuple(self._all_bands[number] for number in self.bands)
             )
-        options = {"camera": self._camera} | options | {"region_params": self.region_params}
-        return VehicleDetector(self.model, search_params=params, **options)
+        camera = open_camera(options.pop("camera", self.camera))
+        if self.camera.horizon_is_known and camera is not self.camera:
+            camera = camera.with_horizon(self.camera.horizon)
+        options["region_params"] = self.region_params
+        return VehicleDetector(self.model, search_params=params, camera=camera, **options)
 
     def render(self) -> Image:
         """Draw the frame with boxes, horizon and the view's windows or heat map: ``(h, w, 3)`` uint8 RGB."""
@@ -321,9 +322,8 @@ class Explorer:
         if self.view == "heat":
             heat = np.asarray(cv2.resize(self.heat_map(), image.shape[1::-1]), np.float32)
             image = blend(image, heat_image(heat), 0.6)
-        if self.search_params.horizon is not None:
-            row = min(round(self.search_params.horizon * len(image)), len(image) - 1)
-            image[row, ::4] = _HORIZON_COLOR
+        row = min(round(self.camera.horizon * len(image)), len(image) - 1)
+        image[row, ::4] = _HORIZON_COLOR
         if self.view == "windows":
             _draw_windows(image, self.windows(), scale)
         explanation = self.explanation()
@@ -348,9 +348,8 @@ class Explorer:
 
     def widget(self) -> Any:
         """Create the sliders and the image, an ``ipywidgets.HBox``; ipywidgets must be installed."""
-        horizon = self.search_params.horizon
         values: dict[str, Any] = {"frame": self.frame, "view": self.view, "box": self.box}
-        values |= {"min_score": self.search_params.min_score, "horizon": 0.5 if horizon is None else horizon}
+        values |= {"min_score": self.search_params.min_score, "horizon": round(self.camera.horizon, 2)}
         sizes = [tuple(map(round, band.window)) for band in self._all_bands]
         bands = [(f"{number}: {width}x{height}", number) for number, (width, height) in enumerate(sizes)]
         if bands:

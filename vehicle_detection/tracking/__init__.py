@@ -1,7 +1,26 @@
 """Tracking: detections of single frames in, vehicles with constant identities out."""
 
-from vehicle_detection.tracking.interpolation import backfill_tracks, interpolate_tracks
+from vehicle_detection.tracking.horizon import HorizonEstimate, estimate_horizon
+from vehicle_detection.tracking.interpolation import (
+    backfill_results,
+    interpolate_results,
+    search_delay,
+    search_interval,
+)
+from vehicle_detection.tracking.scene_cuts import SceneCuts
 from vehicle_detection.tracking.track import FrameResult, Track, TrackParams
 from vehicle_detection.tracking.tracker import Tracker
 
-__all__ = ["FrameResult", "Track", "TrackParams", "Tracker", "backfill_tracks", "interpolate_tracks"]
+__all__ = [
+    "FrameResult",
+    "HorizonEstimate",
+    "SceneCuts",
+    "Track",
+    "TrackParams",
+    "Tracker",
+    "backfill_results",
+    "estimate_horizon",
+    "interpolate_results",
+    "search_delay",
+    "search_interval",
+]

@@ -1,22 +1,22 @@
-"""Estimates the horizon of a video from the tracked vehicles.
+"""The horizon of a video: recursively from its tracks, or once from the boxes of some frames.
 
-On a flat road the bottom edge of a box lies below the horizon by the box's width times the ratio of the
-camera's height to the vehicle's width: a straight line for each vehicle, whose value at width 0 is the
-horizon. The slopes differ between vehicles, as their widths do, around a mean that is roughly known. All
-lines are fitted together, with the slopes as random effects (Laird and Ware, *Biometrics*, 1982). A vehicle
-at constant distance therefore contributes little, several vehicles more, and an approaching one most.
+On a flat road the bottom edge of a box lies below the horizon by the box's size times the ratio of the
+camera's height to the vehicle's: a straight line for each vehicle, whose value at size 0 is the horizon.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import Floats
-from vehicle_detection.camera import Camera, FrameShape, lateral_offsets
+from vehicle_detection._common import Floats, check_boxes, check_shape
+from vehicle_detection.boxes import Detections
+from vehicle_detection.camera import Camera, FrameShape, lateral_offsets, truncated_edges
+from vehicle_detection.errors import InvalidInputError
 
 # Times (s): correlation of the errors of a vehicle's boxes; decay of the sums; faster decay of the sums where
 # no vehicle fits them.
@@ -25,10 +25,31 @@ _CORRELATION_TIME, _MEMORY_TIME, _MISFIT_TIME = 0.5, 30.0, 3.0
 _OUTLIER, _MIN_WEIGHT = 3.0, 1e-4
 # Minimum standard error of the estimate, in pixels of the reference camera.
 _MIN_STD_PX = 1.0
+# The following constants are those of `estimate_horizon`. Number of boxes required.
+_MIN_BOXES = 4
+# Prior of the camera's height (m), and its standard deviation.
+_CAMERA_HEIGHT, _CAMERA_HEIGHT_STD = 1.35, 0.3
+# Prior standard deviation of the horizon around the middle row, as a fraction of the frame's height.
+_PRIOR_STD = 0.15
+# Standard error of a bottom edge in pixels of a frame 1280 wide.
+_EDGE_STD_PX = 3.5
+# Standard deviation of vehicles' heights, as a fraction.
+_RELATIVE_STD = 0.12
+# Boxes with a larger residual, in standard errors, are ignored.
+_BIWEIGHT = 4.7
+# Number of boxes that count as one, because they show the same vehicle.
+_CORRELATED_BOXES = 3.0
+# 80th percentile of the absolute values of a normal distribution.
+_NORMAL_80 = 1.282
 
 
 class HorizonFilter:
     """Recursive estimate of the camera's horizon from the tracked vehicles.
+
+    The widths of the boxes are used, without the visible sides. The slopes of the lines differ between
+    vehicles, as their widths do, around a mean that is roughly known. All lines are fitted together, with the
+    slopes as random effects (Laird and Ware, *Biometrics*, 1982): a vehicle at constant distance contributes
+    little, several vehicles more, and an approaching one most.
 
     `prior_camera` is the camera as given, whose horizon is fixed if its standard error is 0, and `camera` the
     current estimate.
@@ -104,3 +125,92 @@ class HorizonFilter:
         self.camera = dataclasses.replace(
             camera, horizon_px=horizon, horizon_std_px=min(std, camera.horizon_std_px)
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class HorizonEstimate:
+    """Estimate of the horizon from the boxes of vehicles.
+
+    Attributes
+    ----------
+    horizon, horizon_std
+        Row of the horizon as a fraction of the frame's height, 0 at the top, and its standard error; treat
+        the estimate as a guess if it exceeds 0.05.
+    camera_height_m
+        Height of the camera above the road in meters, assuming that vehicles are 1.5 m high.
+    n_boxes
+        Number of boxes used.
+    """
+
+    horizon: float
+    horizon_std: float
+    camera_height_m: float
+    n_boxes: int
+
+
+def estimate_horizon(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> HorizonEstimate:
+    """Estimate the height of the horizon from the boxes of vehicles, of one frame or of many.
+
+    On a flat road the bottom edge of a box lies below the horizon by the box's height times the ratio of the
+    camera's height to the vehicle's height: a straight line, whose value at height 0 is the horizon. The
+    box's height is used, because its width includes the side of a vehicle in another lane. The height of most
+    cameras is roughly known (1.35 m, standard deviation 0.3 m), so that boxes of similar sizes suffice. The
+    line is fitted by iteratively reweighted least squares with Tukey's biweight, which ignores trucks and
+    false boxes (Beaton and Tukey, *Technometrics*, 1974).
+
+    Parameters
+    ----------
+    boxes
+        ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, at least 4 of them not truncated.
+    shape
+        ``(height, width, ...)`` of the frames.
+
+    Returns
+    -------
+    HorizonEstimate
+        The horizon as a fraction of the height, its standard error, and the height of the camera.
+
+    Raises
+    ------
+    InvalidInputError
+        If too few boxes are not truncated.
+
+    Examples
+    --------
+    >>> height = np.arange(40, 200, 10)
+    >>> bottom = 396 + 0.9 * height
+    >>> boxes = np.stack([600 - height / 2, bottom - height, 600 + height / 2, bottom], axis=1)
+    >>> found = estimate_horizon(boxes, (720, 1280))
+    >>> round(found.horizon, 3), round(found.camera_height_m, 2)
+    (0.55, 1.35)
+    """
+    frame = check_shape(shape)
+    array = check_boxes(boxes).astype(np.float64)
+    whole = array[~truncated_edges(array, frame).any(axis=1)]
+    if len(whole) < _MIN_BOXES:
+        raise InvalidInputError(
+            f"boxes must contain {_MIN_BOXES} vehicles that are not truncated by the frame, got "
+            f"{len(whole)}; use more frames"
+        )
+    mean = np.array([0.5 * frame[0], _CAMERA_HEIGHT])
+    information = np.diag([1 / (_PRIOR_STD * frame[0]) ** 2, 1 / _CAMERA_HEIGHT_STD**2])
+    size, bottom = (whole[:, 3] - whole[:, 1]) / Camera.vehicle_height_m, whole[:, 3]
+    edge_std = _EDGE_STD_PX * max(frame) / 1280
+    found = np.array([np.median(bottom - _CAMERA_HEIGHT * size), _CAMERA_HEIGHT])
+    for _ in range(30):
+        variance = edge_std**2 + np.square(_RELATIVE_STD * found[1] * size)
+        residual = (bottom - found[0] - found[1] * size) / np.sqrt(variance)
+        weight = np.square(np.maximum(1 - np.square(residual / _BIWEIGHT), 0)) / variance / _CORRELATED_BOXES
+        crossed = (weight * size).sum()
+        normal = information + np.array([[weight.sum(), crossed], [crossed, (weight * size * size).sum()]])
+        vector = np.array([(weight * bottom).sum(), (weight * size * bottom).sum()])
+        found = np.linalg.solve(normal, vector + information @ mean)
+    std = math.sqrt(np.linalg.inv(normal)[0, 0])
+    # Boxes that do not lie on a line are no vehicles on a flat road.
+    std *= max(1.0, float(np.percentile(np.abs(residual), 80)) / _NORMAL_80)
+    return HorizonEstimate(
+        horizon=float(found[0]) / frame[0],
+        horizon_std=std / frame[0],
+        camera_height_m=float(found[1]),
+        n_boxes=len(whole),
+    )

@@ -1,8 +1,9 @@
-"""Tracks of the frames between two searched frames, and of those before a track was confirmed."""
+"""Results of the frames between two searched frames, and of those before a track was confirmed."""
 
 from __future__ import annotations
 
 import math
+import time as clock
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,7 +12,8 @@ import numpy as np
 
 from vehicle_detection._common import Floats
 from vehicle_detection.boxes import clip_boxes
-from vehicle_detection.tracking.track import TIME_TOLERANCE, Track
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tracking.track import TIME_TOLERANCE, FrameResult, Track, TrackParams
 
 _INTERPOLATED = (
     "score",
@@ -25,6 +27,52 @@ _INTERPOLATED = (
 )
 
 _MIN_DISTANCE = 1.0  # of a vehicle that moves on after its last detection (m)
+_MIN_SEARCH_RATE = 12.0  # searches per second of a video, at least
+
+
+def search_interval(fps: float) -> int:
+    """Interval of the frames of a video to search: every one, or fewer if its rate is above 24 per second."""
+    return max(1, int(fps / _MIN_SEARCH_RATE + 0.01))  # 23.976 counts as 24
+
+
+def search_delay(params: TrackParams, fps: float, interval: int) -> int:
+    """Return how many searched frames to hold back for `backfill_results`."""
+    return int(params.backfill * fps / interval + 0.01)
+
+
+def interpolate_results(
+    before: FrameResult, after: FrameResult | None, times: Sequence[float], shape: tuple[int, ...]
+) -> list[FrameResult]:
+    """Return the results of the frames between two searched frames, with interpolated tracks.
+
+    Parameters
+    ----------
+    before, after
+        Results of the searched frames, with times; `after` is None at the end of a video.
+    times
+        Times in seconds of the frames between.
+    shape
+        ``(height, width, ...)`` of the frames.
+    """
+    results = []
+    for number, time in enumerate(times):
+        start = clock.perf_counter()
+        if before.time is None or (after is not None and after.time is None):
+            raise InvalidInputError("before and after must have times; pass time= to track")
+        dt_after, following = 0.0, tuple[Track, ...]()
+        if after is not None and after.time is not None:
+            dt_after, following = after.time - time, after.tracks
+        tracks = interpolate_tracks(before.tracks, following, time - before.time, dt_after, shape)
+        results.append(FrameResult.unsearched(before.index + 1 + number, time, tracks, start))
+    return results
+
+
+def backfill_results(results: Sequence[FrameResult]) -> list[FrameResult]:
+    """Show the tracks that are confirmed in the last of consecutive searched frames in the others, too."""
+    if not results or not any(track.id for track in results[-1].tracks):
+        return list(results)
+    *earlier, last = results
+    return [*(replace(each, tracks=backfill_tracks(each.tracks, last.tracks)) for each in earlier), last]
 
 
 def interpolate_tracks(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time as clock
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -189,6 +190,14 @@ class FrameResult:
     seconds: dict[str, float] = field(default_factory=dict)
     searched: bool = True
     frame: NDArray[np.uint8] | None = field(default=None, compare=False)
+
+    @classmethod
+    def unsearched(
+        cls, index: int, time: float | None, tracks: tuple[Track, ...], started: float
+    ) -> FrameResult:
+        """Make the result of a frame that was not searched, whose tracking `started` at this clock time."""
+        none, seconds = Detections.empty(), {"track": clock.perf_counter() - started}
+        return cls(index, time, none, none, tracks, seconds, searched=False)
 
     @property
     def shown(self) -> tuple[Track, ...]:

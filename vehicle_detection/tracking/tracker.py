@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import Floats, check_integer, check_number, check_shape, check_type
-from vehicle_detection.boxes import Detections, Platt, box_areas, on_one_vehicle
-from vehicle_detection.camera import UNKNOWN_LENS_STD, Camera, FrameShape, truncated_edges
+from vehicle_detection.boxes import LOG_ODDS, Detections, Platt, box_areas, on_one_vehicle
+from vehicle_detection.camera import Camera, FrameShape, truncated_edges
 from vehicle_detection.tracking.association import (
     covered_fractions,
     distinct_vehicles,
@@ -56,7 +56,6 @@ _TENTATIVE_DISTANCE, _LOW_SCORE_DISTANCE = 0.6, 0.5
 # Smallest IoU of a confirmed track with a low-score detection, that of ByteTrack's code: a box that also
 # covers the lamp post above a vehicle says nothing about its height.
 _LOW_SCORE_IOU = 0.5
-_LOG_ODDS = Platt(-1.0, 0.0)
 # Difference of the scores of two tracks on one vehicle from which on the lower one shows a part of it.
 _PART_GAP = 2.0
 # Seconds without a detection after which `max_distance` stops growing.
@@ -71,8 +70,8 @@ class Tracker:
     params, fps
         Thresholds, times and noise of the tracks; frames per second where `update` is called without a time.
     camera
-        The camera, for distances and speeds; by default ``Camera.for_frame`` of the frame's size, with a
-        horizon that is estimated from the vehicles.
+        The camera, for distances and speeds; by default `Camera.dashcam`. An uncertain horizon is estimated
+        from the vehicles.
     calibration
         Converts scores to the confidences of the tracks; by default scores are log-odds, and 0 is 50%. None
         leaves the confidences unknown.
@@ -98,7 +97,7 @@ class Tracker:
         *,
         fps: float = 25.0,
         camera: Camera | None = None,
-        calibration: Platt | None = _LOG_ODDS,
+        calibration: Platt | None = LOG_ODDS,
     ) -> None:
         if params is not None:
             check_type(params, "params", TrackParams, "pass TrackParams()")
@@ -110,30 +109,20 @@ class Tracker:
         self._frame_seconds = 1 / check_number(fps, "fps", above=0, high=1e6)
         self.params = params or TrackParams()
         self._smoother = make_smoother(self.params)
-        self._given_camera = camera
+        self._given_camera = camera or Camera.dashcam()
         self.reset()
 
     def reset(self) -> None:
         """Restore the initial state: the next frame is the first, and the next vehicle gets the id 1."""
         self._shape: FrameShape | None = None
-        self._open_horizon()
+        self._open_horizon(self._given_camera.shape or (720, 1280))
         self._time: float | None = None
         self._next_id = self._next_key = 1
         self.end_tracks()
 
-    def set_camera(self, camera: Camera) -> None:
-        """Use another camera from the next frame on, for example if the size of the frames changes."""
-        check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
-        given = self._given_camera
-        if given is None or (camera, camera.shape) != (given, given.shape):
-            self._given_camera = camera
-            self._open_horizon()
-
-    def _open_horizon(self, frame: FrameShape | None = None) -> None:
-        """Start the estimate of the horizon for frames of this shape; by default a likely one."""
-        given = self._given_camera
-        shape = frame or (given and given.shape) or self._shape or (720, 1280)
-        camera = _default_camera(shape) if given is None else given.for_shape(shape)
+    def _open_horizon(self, shape: FrameShape) -> None:
+        """Start the estimate of the horizon for frames of this shape."""
+        camera = self._given_camera.for_shape(shape)
         # The camera, if boxes must be rectified.
         self._lens = camera if camera.fisheye else None
         self._horizon, self._horizon_shape = HorizonFilter(camera.to_pinhole(shape)), shape
@@ -151,6 +140,12 @@ class Tracker:
         self._at_start = True
         self._tracks: tuple[Track, ...] = ()
 
+    def follows(self, shape: tuple[int, ...], time: float | None = None) -> bool:
+        """Whether a frame of this shape and time continues the video, so that `predict` applies to it."""
+        if self._shape is None or self._time is None or tuple(shape[:2]) != self._shape:
+            return False
+        return time is None or 0 < time - self._time <= self.params.max_gap
+
     def update(
         self,
         detections: Detections,
@@ -158,6 +153,7 @@ class Tracker:
         *,
         time: float | None = None,
         frames: int = 1,
+        cut: bool = False,
     ) -> tuple[Track, ...]:
         """Process the detections of the next frame and return all tracks, including those not shown.
 
@@ -170,6 +166,8 @@ class Tracker:
             Time of the frame in seconds, by default `frames` frames after the last. A frame with the same
             time as the last one changes nothing. An earlier time, a gap of more than ``params.max_gap`` and
             another `shape` end all tracks.
+        cut
+            Whether the frame begins another scene (`SceneCuts`), which ends all tracks, too.
 
         Returns
         -------
@@ -185,6 +183,8 @@ class Tracker:
             detections = Detections.from_supervision(detections)
         check_type(detections, "detections", Detections, "pass Detections(boxes, scores)")
         frame = check_shape(shape)
+        if cut:
+            self.end_tracks()
         dt = self._advance(frame, time, check_integer(frames, "frames", low=1))
         if dt == 0:
             return self._tracks
@@ -469,10 +469,6 @@ class Tracker:
                 self._live, boxes, velocities, confidences, ranges
             )
         )
-
-
-def _default_camera(frame: FrameShape) -> Camera:
-    return Camera.for_frame(frame, horizon_std_px=0.05 * frame[0], focal_std=UNKNOWN_LENS_STD)
 
 
 def _sorted_inside(detections: Detections, frame: FrameShape) -> tuple[Floats, Floats]:

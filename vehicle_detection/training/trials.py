@@ -23,7 +23,7 @@ from vehicle_detection._common import (
     is_listing,
 )
 from vehicle_detection.datasets import PatchSet, Split
-from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.detector import Detector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import (
     LabelledFrames,
@@ -335,8 +335,8 @@ class TrialEvaluator:
 
     def _score_set(self, classifier: VehicleClassifier, frames: LabelledFrames) -> tuple[float, ...]:
         """Values of `_FRAME_METRICS` on a set of frames."""
-        parts = {name: getattr(self.options, name) for name in ("search_params", "region_params")}
-        with VehicleDetector(classifier, **parts, horizon=frames.horizon) as detector:
+        search, regions = self.options.search_params.with_horizon(frames.horizon), self.options.region_params
+        with Detector(classifier, search_params=search, region_params=regions) as detector:
             found = TrackTable.from_detections({key: detector.detect(image) for key, image in frames})
         scores = evaluate_detections(found, frames.labels, frames=frames.keys)
         best, _ = best_f1(*precision_recall_curve(found, frames.labels))

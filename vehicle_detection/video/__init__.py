@@ -1,5 +1,6 @@
 """Reading and writing video: sources, ffmpeg, the engine that tracks, and the annotated video."""
 
+from vehicle_detection.video.clips import annotate_clip
 from vehicle_detection.video.engine import TrackRun, VideoDetector, VideoReport, track
 from vehicle_detection.video.files import is_video_file, list_files, walk_files
 from vehicle_detection.video.horizon import estimate_video_horizon
@@ -31,6 +32,7 @@ __all__ = [
     "VideoInfo",
     "VideoReport",
     "Viewer",
+    "annotate_clip",
     "borrow_source",
     "check_video_target",
     "cut_video",

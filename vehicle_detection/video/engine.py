@@ -35,8 +35,14 @@ from vehicle_detection._common import (
     single_threaded_opencv,
 )
 from vehicle_detection.errors import DetectorError, InvalidInputError
-from vehicle_detection.images import is_cut, make_thumbnail
-from vehicle_detection.tracking import FrameResult
+from vehicle_detection.tracking import (
+    FrameResult,
+    SceneCuts,
+    backfill_results,
+    interpolate_results,
+    search_delay,
+    search_interval,
+)
 from vehicle_detection.video.reading import AudioSource, Reader, check_span, frame_range
 from vehicle_detection.video.sources import FrameSource, Source, borrow_source
 
@@ -57,8 +63,12 @@ class VideoDetector(Protocol):
     def search(self, frame: Frame, /) -> Any:
         """Search one frame; called from several threads, and before earlier frames are tracked."""
 
-    def track(self, found: Any, /, *, time: float | None) -> Any:
-        """Update the tracks with a frame's search result, in frame order, and return the frame's result."""
+    def track(self, found: Any, /, *, time: float | None, frames: int, cut: bool) -> Any:
+        """Update the tracks with a frame's search result, in frame order, and return the frame's result.
+
+        `frames` is 1 plus the number of frames before it that were not searched, and `cut` says whether it
+        begins another scene.
+        """
 
     def reset(self, *, fps: float) -> None:
         """Forget all frames."""
@@ -202,10 +212,9 @@ class ClosableQueue(Generic[Item]):
 class _QueuedFrame:
     time: float
     frame: Frame | None  # None if nobody asked for it
-    thumbnail: NDArray[np.float32]
+    cut: bool  # whether it begins another scene
     search: Future[tuple[Any, float]] | None  # None: the frame is not searched
     missed: int = 0  # frames that a live source dropped before this one
-    last_thumbnail: NDArray[np.float32] | None = None  # of the frame before
 
 
 @dataclass
@@ -227,8 +236,8 @@ class _Pipeline:
 
     With an `interval` above 1, only every n-th frame and the first one of each scene are searched, and each
     frame after a gap of a live source. The frames between wait for the next searched frame, and get
-    interpolated tracks. With a `delay` above 0, that many searched frames are held back, so that the detector
-    can still change their results. Up to `lookahead` frames are decoded before they are needed.
+    interpolated tracks. With a `delay` above 0, that many searched frames are held back, because a track
+    that is confirmed later is shown in them, too. Up to `lookahead` frames are decoded ahead.
     """
 
     def __init__(
@@ -238,11 +247,12 @@ class _Pipeline:
         workers: int,
         interval: int,
         *,
+        shape: tuple[int, ...],
         delay: int,
         lookahead: int,
         frames: bool,
     ) -> None:
-        self._open_reader, self._detector = open_reader, detector
+        self._open_reader, self._detector, self._shape = open_reader, detector, shape
         self._workers, self._interval, self._delay, self._keeps_frames = workers, interval, delay, frames
         self.stages: defaultdict[str, float] = defaultdict(float)
         self.missed = 0
@@ -315,22 +325,22 @@ class _Pipeline:
 
     def _decode(self, reader: Reader, pool: ThreadPoolExecutor) -> None:
         try:
-            last, skipped, expected = None, 0, None
+            cuts, skipped, expected = SceneCuts(), 0, None
             for index, moment, frame in reader:
                 if self.stopped:
                     break
-                thumbnail = make_thumbnail(frame)
+                cut = cuts.update(frame)
                 skipped += 1
                 missed = index - expected if expected is not None else 0
-                if last is None or missed or skipped >= self._interval or is_cut(last, thumbnail):
+                if expected is None or missed or cut or skipped >= self._interval:
                     search, skipped = pool.submit(self._search, frame), 0
                 else:
                     search = None
                 kept = frame if self._keeps_frames else None
-                self._searched.put(_QueuedFrame(moment, kept, thumbnail, search, missed, last))
+                self._searched.put(_QueuedFrame(moment, kept, cut, search, missed))
                 del frame, kept
                 self.missed += missed
-                last, expected = thumbnail, index + 1
+                expected = index + 1
         except QueueClosed:
             return
         except BaseException as error:  # raised in the tracking thread
@@ -356,7 +366,7 @@ class _Pipeline:
             held.append(_Searched(waiting, item, self._track(item, waiting)))
             waiting = []
             if self._delay:
-                results = self._detector.backfill([searched.result for searched in held])
+                results = backfill_results([searched.result for searched in held])
                 for searched, result in zip(held, results, strict=True):
                     searched.result = result
             if len(held) > self._delay:
@@ -373,10 +383,9 @@ class _Pipeline:
             found, seconds = item.search.result()
         except DetectorError as error:
             raise DetectorError(f"at {item.time:.2f} s: {error}") from error
-        for thumbnail in [each.thumbnail for each in waiting] + [item.last_thumbnail] * item.missed:
-            self._detector.skip(thumbnail)
         self.stages["search"] += seconds
-        return self._detector.track(found, time=item.time)
+        frames = 1 + len(waiting) + item.missed
+        return self._detector.track(found, time=item.time, frames=frames, cut=item.cut)
 
     def _emit_searched(self, before: Any, searched: _Searched) -> Any:
         """Queue a searched frame after those before it that were not searched; return its result."""
@@ -387,7 +396,7 @@ class _Pipeline:
     def _emit_between(self, before: Any, after: Any, waiting: list[_QueuedFrame]) -> None:
         """Interpolate and queue the results of the `waiting` frames; `after` is None at the end."""
         if waiting:
-            results = self._detector.interpolate(before, after, [item.time for item in waiting])
+            results = interpolate_results(before, after, [item.time for item in waiting], self._shape)
             for item, result in zip(waiting, results, strict=True):
                 self._emit(item, result)
 
@@ -584,14 +593,16 @@ def track(
         info = opened.info
         first, count = frame_range(info, start, end)
         fps = float(info.fps)
-        interval = every or getattr(found, "search_interval", lambda fps: 1)(fps)
+        interval = every or (1 if getattr(found, "searches_every_frame", True) else search_interval(fps))
+        params = getattr(found, "track_params", None)
         ahead = min(n_workers * interval, _LOOKAHEAD_BYTES // math.prod(info.shape))
         pipeline = _Pipeline(
             functools.partial(opened.read, first, count),
             found,
             n_workers,
             interval,
-            delay=0 if opened.live else getattr(found, "search_delay", lambda fps: 0)(fps),
+            shape=info.shape,
+            delay=0 if opened.live or params is None else search_delay(params, fps, interval),
             lookahead=max(n_workers, ahead) + 1,
             frames=frames,
         )

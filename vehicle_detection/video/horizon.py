@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection.boxes import Detections
-from vehicle_detection.camera import HorizonEstimate, estimate_horizon
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tracking import HorizonEstimate, estimate_horizon
 from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.reading import check_span, frame_range
 from vehicle_detection.video.sources import Source, borrow_source

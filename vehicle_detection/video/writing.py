@@ -333,8 +333,6 @@ def process_video(
         check_video_target(target, preset=preset)
     results = track(source, detector, frames=draws, progress=progress, **options)
     annotator: Any = getattr(results.detector, "annotator", None)
-    if draws and hasattr(results.detector, "camera_of"):
-        annotator.camera = results.detector.camera_of(results.info.shape)
     return write_video(results, target, annotator, audio=audio, preset=preset, show=show, on_result=on_result)
 
 

@@ -16,11 +16,12 @@ from moviepy import (
 )
 
 from tests.video.clips import write_clip
-from vehicle_detection.annotator import DrawParams
-from vehicle_detection.detector import VehicleDetector, detector_from
+from vehicle_detection.annotator import Annotator, DrawParams
+from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.function_model import detector_from
 from vehicle_detection.scenes import render_drive
-from vehicle_detection.video import probe_video
+from vehicle_detection.video import annotate_clip, probe_video
 
 SHAPE = (120, 200)
 
@@ -57,7 +58,7 @@ class Recorder:
 
     def __init__(self, clip, **options):
         self.results = []
-        self.clip = detector_from(find_red).annotate_clip(clip, on_result=self.results.append, **options)
+        self.clip = annotate_clip(clip, detector_from(find_red), on_result=self.results.append, **options)
 
     @property
     def times(self):
@@ -113,7 +114,7 @@ def test_clips_and_the_detector_have_tracks_of_their_own(expected):
     for step in range(8):
         result = detector.process(frame_with(150 - step), step / 25)
     seen = [[], []]
-    first, second = (detector.annotate_clip(clip_of(), on_result=results.append) for results in seen)
+    first, second = (annotate_clip(clip_of(), detector, on_result=results.append) for results in seen)
     for step, picture in enumerate(expected):  # alternately
         np.testing.assert_array_equal(first.get_frame(step / 25), picture)
         np.testing.assert_array_equal(second.get_frame(step / 25), picture)
@@ -126,7 +127,7 @@ def test_clips_and_the_detector_have_tracks_of_their_own(expected):
 def test_duration_frame_rate_and_audio_are_kept(tmp_path):
     sound = AudioClip(lambda t: np.sin(2765 * t), duration=0.8, fps=44100)
     clip = clip_of().with_audio(sound)
-    annotated = detector_from(find_red).annotate_clip(clip)
+    annotated = annotate_clip(clip, detector_from(find_red))
     assert (annotated.duration, annotated.fps, annotated.size) == (clip.duration, 25, clip.size)
     assert annotated.audio.duration == 0.8
     target = tmp_path / "out.mp4"
@@ -185,7 +186,7 @@ def test_another_speed_after_annotating_keeps_times_of_the_clip(factor, expected
 @pytest.mark.parametrize("method", ["chain", "compose"])
 def test_clips_are_concatenated(method, expected):
     detector, seen = detector_from(find_red), [[], []]
-    parts = [detector.annotate_clip(clip_of(), on_result=results.append) for results in seen]
+    parts = [annotate_clip(clip_of(), detector, on_result=results.append) for results in seen]
     joined = pictures(concatenate_videoclips(parts, method=method))
     assert len(joined) == 40
     # At 0.8 s moviepy rounds in favor of the first clip and repeats its last frame.
@@ -201,9 +202,9 @@ def test_clips_are_concatenated(method, expected):
 
 def test_clips_are_shown_side_by_side(expected):
     detector = detector_from(find_red)
-    row = clips_array([[detector.annotate_clip(clip_of()), detector.annotate_clip(clip_of())]])
+    row = clips_array([[annotate_clip(clip_of(), detector), annotate_clip(clip_of(), detector)]])
     assert_same(pictures(row), [np.concatenate([picture, picture], axis=1) for picture in expected])
-    composed = CompositeVideoClip([detector.annotate_clip(clip_of()), ImageClip(expected[0][:9, :9])])
+    composed = CompositeVideoClip([annotate_clip(clip_of(), detector), ImageClip(expected[0][:9, :9])])
     assert composed.get_frame(0).shape == (*SHAPE, 3)
 
 
@@ -220,8 +221,8 @@ def test_clips_without_a_frame_rate():
 
 
 def test_diagnostics_are_another_picture():
-    detector = detector_from(find_red, diagnostics=True)
-    annotated = detector.annotate_clip(clip_of(3))
+    detector = detector_from(find_red, annotator=Annotator(diagnostics=True))
+    annotated = annotate_clip(clip_of(3), detector)
     assert pictures(annotated)[0].shape[:2] == annotated.size[::-1]
 
 
@@ -236,10 +237,12 @@ def test_speeds_are_right_for_every_frame_rate():
         truth = [row for rows in drive.truth for row in rows if not row.ignore]
         boxes = [np.array([row.box for row in rows if not row.ignore]).reshape(-1, 4) for rows in drive.truth]
         found = iter(boxes)
-        detector = detector_from(lambda image, found=found: ((box := next(found)), [0.95] * len(box)))
+        detector = detector_from(
+            lambda image, found=found: ((box := next(found)), [0.95] * len(box)), camera=drive[0].camera
+        )
         clip = ImageSequenceClip([np.zeros((360, 640, 3), np.uint8)] * len(drive), fps=fps)
         results = []
-        pictures(detector.annotate_clip(clip, on_result=results.append))
+        pictures(annotate_clip(clip, detector, on_result=results.append))
         medians[fps] = np.median(speeds_of(results[-fps // 2 :])), np.median([row.speed_mps for row in truth])
     for estimate, true in medians.values():
         # A wrong frame rate would double or halve it.
@@ -266,22 +269,22 @@ def test_what_is_no_clip_is_refused(clip):
     with pytest.raises(
         InvalidInputError, match=r"clip must be a video clip of moviepy 2, got .*process_video"
     ):
-        detector_from(find_red).annotate_clip(clip)
+        annotate_clip(clip, detector_from(find_red))
     with pytest.raises(InvalidInputError, match="on_result must be a function"):
-        detector_from(find_red).annotate_clip(clip_of(1), on_result=5)
+        annotate_clip(clip_of(1), detector_from(find_red), on_result=5)
 
 
 def test_a_shipped_model_annotates_a_clip():
     drive = render_drive(frames=8, shape=(360, 640))
     clip = ImageSequenceClip([scene.image for scene in drive], fps=drive.fps)
-    with VehicleDetector(n_jobs=1) as detector:
-        assert len(pictures(detector.annotate_clip(clip))) == 8
+    with VehicleDetector(jobs=1) as detector:
+        assert len(pictures(annotate_clip(clip, detector))) == 8
 
 
 def test_a_view_beside_the_frame_widens_the_clip():
-    detector = detector_from(find_red, draw_params=DrawParams(panel="side"))
-    clip = detector.annotate_clip(clip_of(3))
-    height, width, _ = detector.annotated_shape((*SHAPE, 3))
+    detector = detector_from(find_red, annotator=Annotator(DrawParams(panel="side")))
+    clip = annotate_clip(clip_of(3), detector)
+    height, width, _ = detector.annotator.output_shape((*SHAPE, 3))
     assert width > SHAPE[1]
     assert tuple(clip.size) == (width, height)
     assert {frame.shape for frame in pictures(clip)} == {(height, width, 3)}

@@ -18,7 +18,7 @@ from vehicle_detection import (
 )
 from vehicle_detection.drive import explain_tracks
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.explanation import patch_cell_shares
+from vehicle_detection.evaluation.explanation import patch_cell_shares
 from vehicle_detection.features import part_slices
 from vehicle_detection.function_model import FunctionModel
 from vehicle_detection.scenes import SceneVehicle
@@ -174,7 +174,7 @@ def test_a_detected_box_of_a_track_is_explained(detector, tmp_path, seconds, fra
 
 
 def test_bad_arguments_are_refused(detector):
-    with pytest.raises(InvalidInputError, match="detector must be a VehicleDetector"):
+    with pytest.raises(InvalidInputError, match="detector must be a Detector or VehicleDetector"):
         explain(detector.model, SCENE.image, [0, 0, 9, 9])
     with pytest.raises(InvalidInputError, match="image must be"):
         explain(detector, SCENE.image[..., 0], [0, 0, 9, 9])

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import Floats, check_boxes, check_image, check_type, describe
 from vehicle_detection.boxes import clip_boxes, iou_matrix
-from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.detector import Detector, VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE, FeatureParams, extract_features, part_slices, sum_blocks
 from vehicle_detection.network import NetworkModel, NetworkParams, NetworkSearch
@@ -89,13 +89,13 @@ class Explanation:
         return f"Explanation({self})"
 
 
-def explain(detector: VehicleDetector, image: NDArray[np.uint8], box: ArrayLike) -> Explanation:
+def explain(detector: Detector | VehicleDetector, image: NDArray[np.uint8], box: ArrayLike) -> Explanation:
     """Explain why a detector finds a vehicle in a box of an image, or why not.
 
     Parameters
     ----------
     detector
-        A `VehicleDetector` with a network or a classifier of patches.
+        A detector with a network or a classifier of patches.
     image
         ``(H, W, 3)`` uint8 RGB.
     box
@@ -130,7 +130,8 @@ def explain(detector: VehicleDetector, image: NDArray[np.uint8], box: ArrayLike)
     >>> explanation.found, explanation.margin < 0
     (False, True)
     """
-    check_type(detector, "detector", VehicleDetector, "pass VehicleDetector()")
+    check_type(detector, "detector", (Detector, VehicleDetector), "pass VehicleDetector()")
+    detector = detector.detector if isinstance(detector, VehicleDetector) else detector
     frame = check_image(image)
     boxes = check_boxes([box], "box").astype(np.float64)
     if boxes.shape != (1, 4) or (boxes[:, 2:] - boxes[:, :2] < 1).any():
@@ -158,9 +159,9 @@ def _best_overlap(box: Floats, boxes: Floats, min_iou: float) -> int | None:
 
 
 def _explain_network(
-    detector: VehicleDetector, model: NetworkModel, image: NDArray[np.uint8], box: Floats
+    detector: Detector, model: NetworkModel, image: NDArray[np.uint8], box: Floats
 ) -> Explanation:
-    params: Any = detector.search_params_of(image.shape)
+    params: Any = detector.search_params
     vehicles = detector.search(image).vehicles
     assert vehicles is not None
     row = _best_overlap(box, vehicles.boxes, _MIN_IOU)
@@ -222,7 +223,7 @@ class _Surroundings:
 
 
 def _explain_classifier(
-    detector: VehicleDetector, model: VehicleClassifier, image: NDArray[np.uint8], box: Floats
+    detector: Detector, model: VehicleClassifier, image: NDArray[np.uint8], box: Floats
 ) -> Explanation:
     windows = detector.search(image).windows
     overlaps = iou_matrix(box[None], windows.boxes)[0]

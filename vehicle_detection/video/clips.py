@@ -1,0 +1,105 @@
+"""Annotate clips of moviepy."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._common import check_integer, describe
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tracking import FrameResult
+
+Clip = TypeVar("Clip")
+
+# Frame rate that is assumed where it is unknown.
+_USUAL_FPS = 25.0
+# Frames: rounding error of a time times the frame rate, as in moviepy.
+_FRAME_TOLERANCE = 1e-5
+
+
+def annotate_clip(
+    clip: Clip, detector: Any, *, every: int = 1, on_result: Callable[[FrameResult], object] | None = None
+) -> Clip:
+    """Annotate a moviepy clip: a new clip with the same duration, frame rate and audio.
+
+    The new clip has tracks of its own, numbered from 1; those of the detector and of other clips are neither
+    used nor changed. Frames are processed when they are read, with their times in `clip`. Before and after,
+    every method and effect of moviepy applies, such as ``subclipped``, ``resized`` and
+    ``concatenate_videoclips``. Change the speed afterwards: the estimated speeds are those of `clip`.
+
+    Parameters
+    ----------
+    clip
+        A video clip of moviepy 2.
+    detector
+        A `VehicleDetector`.
+    every
+        Search every n-th frame, to save time; the tracks of the frames between are predicted.
+    on_result
+        Function that is called with the result of each processed frame. moviepy may read a frame more than
+        once: for a preview, a second rendering, or effects such as ``Loop``. A result with the index 0 is the
+        first one of another pass; drop the results before it.
+
+    Returns
+    -------
+    moviepy.VideoClip
+        Reading frames in ascending order tracks the vehicles. The frame that was read last is not processed
+        again. Going back in time, as a second rendering does, forgets all frames and starts anew; its result
+        equals that of the first. Skipping more than ``track_params.max_gap`` seconds ends all tracks.
+
+    Raises
+    ------
+    InvalidInputError
+        If `clip` is not a video clip of moviepy 2.
+
+    Examples
+    --------
+    >>> from moviepy import VideoFileClip  # doctest: +SKIP
+    >>> clip = VideoFileClip("drive.mp4").subclipped(2, 12)  # doctest: +SKIP
+    >>> annotate_clip(clip, VehicleDetector()).write_videofile("found.mp4")  # doctest: +SKIP
+    """
+    given: Any = clip
+    if not all(hasattr(given, name) for name in ("transform", "get_frame", "size")):
+        raise InvalidInputError(
+            f"clip must be a video clip of moviepy 2, got {describe(clip)}; pass VideoFileClip(path), or "
+            "use process_video for a file"
+        )
+    every = check_integer(every, "every", low=1, high=1000)
+    if on_result is not None and not callable(on_result):
+        raise InvalidInputError(f"on_result must be a function of a result, got {describe(on_result)}")
+    fps = getattr(given, "fps", None)
+    annotated: Clip = given.transform(_ClipAnnotator(copy.copy(detector), fps, every, on_result))
+    return annotated
+
+
+class _ClipAnnotator:
+    """The function of a moviepy clip that annotates its frames, with a detector of its own."""
+
+    def __init__(
+        self, detector: Any, fps: float | None, every: int, on_result: Callable[[FrameResult], object] | None
+    ) -> None:
+        self._detector, self._fps, self._every, self._on_result = detector, fps, every, on_result
+        self._time: float | None = None
+
+    def __call__(self, get_frame: Callable[[float], NDArray[np.uint8]], t: float) -> NDArray[np.uint8]:
+        """Return the annotated frame at `t` seconds."""
+        # Times within one frame, as in slow motion, show the same frame.
+        time = float(t) if not self._fps else int(t * self._fps + _FRAME_TOLERANCE) / self._fps
+        if time != self._time:
+            if self._time is None or time < self._time:
+                self._detector.reset(fps=self._fps or _USUAL_FPS)
+                self._count = 0
+            frame = get_frame(time)
+            if frame.dtype != np.uint8:  # effects such as FadeIn return fractions of gray levels
+                frame = np.clip(frame, 0, 255).astype(np.uint8)
+            result = self._detector.process(frame, time, search=self._count % self._every == 0)
+            picture: NDArray[np.uint8] = self._detector.annotate(frame, result)
+            self._picture, self._time = picture, time
+            self._count += 1
+            if self._on_result is not None:
+                self._on_result(result)
+        return self._picture.copy()
