@@ -105,8 +105,6 @@ class VideoReport:
     >>> report = VideoReport(
     ...     frames=250, fps=Fraction(25), shape=(720, 1280, 3), seconds=5.0, stages=stages, tracks=2
     ... )
-    >>> report.frames_per_second, report.stage_fractions["encode"]
-    (50.0, 0.5)
     >>> print(report)
     250 frames of 1280x720 in 5.0 s: 50.0 frames/s, 2.0 times real time, 2 vehicles
     stage    ms/frame  fraction
@@ -219,20 +217,18 @@ class _QueuedFrame:
 
 @dataclass
 class _Searched:
-    """A searched frame with its result, and the frames before it that were not searched."""
+    """A searched frame with its result, and those before it that were not searched."""
 
     between: list[_QueuedFrame]
-    item: _QueuedFrame
+    item: _QueuedFrame | None  # None: the source ends after the frames between
     result: Any
 
 
 class _Pipeline:
-    """The threads that process a source.
+    """Decodes in a thread, searches in a pool, and tracks in the calling thread.
 
-    The decoding thread submits frames to the search workers and queues them in order; the tracking thread
-    takes them from the queue and tracks. The first error stops all of them. The calling thread only receives
-    results: Python raises KeyboardInterrupt in the main thread, where it must not interrupt the start of a
-    process or the removal of a file.
+    The decoding thread also starts and ends the reader: Python raises KeyboardInterrupt in the main thread,
+    where it must not interrupt the start of a process. The first error stops everything.
 
     With an `interval` above 1, only every n-th frame and the first one of each scene are searched, and each
     frame after a gap of a live source. The frames between wait for the next searched frame, and get
@@ -253,24 +249,22 @@ class _Pipeline:
         frames: bool,
     ) -> None:
         self._open_reader, self._detector, self._shape = open_reader, detector, shape
-        self._workers, self._interval, self._delay, self._keeps_frames = workers, interval, delay, frames
+        self._interval, self._delay, self._keeps_frames = interval, delay, frames
         self.stages: defaultdict[str, float] = defaultdict(float)
-        self.missed = 0
-        """Number of frames that a live source dropped."""
-        self.damage = ""
-        """What is damaged in the source; known after the last frame."""
-        self._searched: ClosableQueue[_QueuedFrame] = ClosableQueue(lookahead)
-        self._results: ClosableQueue[Any] = ClosableQueue(1 if frames else 4)
+        self.missed = 0  # frames that a live source dropped
+        self.damage = ""  # what is damaged in the source; known after the last frame
+        self._queue: ClosableQueue[_QueuedFrame] = ClosableQueue(lookahead)
+        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="vehicle-search")
         self._reader: Reader | None = None
         self._lock = threading.Lock()
         self._aborted = self.stopped = False
 
     def run(self) -> Generator[Any]:
-        """Yield the result of each frame; closing the generator stops all threads."""
-        thread = threading.Thread(target=self._track_in_thread, name="vehicle-track")
+        """Yield the result of each frame, in order; closing the generator stops all threads."""
+        thread = threading.Thread(target=self._decode_in_thread, name="vehicle-decode")
         try:
             call_in_thread(thread.start)
-            yield from self._results
+            yield from self._track_frames()
         finally:
             self._abort()  # no effect after a complete run
             if thread.is_alive():
@@ -284,97 +278,80 @@ class _Pipeline:
                 self._reader.kill()
 
     def _abort(self) -> None:
-        """Stop all threads and the reader, or prevent them from starting."""
+        """Stop the decoding thread, the pool and the reader, or prevent them from starting."""
         with self._lock:
             self._aborted = True
-            self._searched.abort()
-            self._results.abort()
+            self._queue.abort()
+            self._pool.shutdown(wait=False, cancel_futures=True)
             if self._reader is not None:
                 self._reader.kill()
 
-    def _track_in_thread(self) -> None:
+    def _decode_in_thread(self) -> None:
+        error: BaseException | None = None
         try:
             with self._open_reader() as reader:
                 with self._lock:
                     if self._aborted:
                         return
                     self._reader = reader
-                self._run_threads(reader)
+                self._decode(reader)
+            self.damage = reader.damage
+            self.stages["decode"] += reader.cpu_seconds
         except QueueClosed:
-            return
-        except BaseException as error:  # raised in the calling thread
-            self._results.finish(error)
-        else:
-            self._results.finish()
-
-    def _run_threads(self, reader: Reader) -> None:
-        """Decode in a thread, search in a pool, and track in this thread."""
-        pool = ThreadPoolExecutor(self._workers, thread_name_prefix="vehicle-search")
-        decoder = threading.Thread(target=self._decode, args=(reader, pool), name="vehicle-decode")
-        try:
-            decoder.start()
-            self._track_frames()
-        finally:
-            self._searched.abort()
-            reader.kill()
-            pool.shutdown(cancel_futures=True)
-            if decoder.ident is not None:
-                decoder.join()
-        self.damage = reader.damage
-        self.stages["decode"] += reader.cpu_seconds
-
-    def _decode(self, reader: Reader, pool: ThreadPoolExecutor) -> None:
-        try:
-            cuts, skipped, expected = SceneCuts(), 0, None
-            for index, moment, frame in reader:
-                if self.stopped:
-                    break
-                cut = cuts.update(frame)
-                skipped += 1
-                missed = index - expected if expected is not None else 0
-                if expected is None or missed or cut or skipped >= self._interval:
-                    search, skipped = pool.submit(self._search, frame), 0
-                else:
-                    search = None
-                kept = frame if self._keeps_frames else None
-                self._searched.put(_QueuedFrame(moment, kept, cut, search, missed))
-                del frame, kept
-                self.missed += missed
-                expected = index + 1
-        except QueueClosed:
-            return
-        except BaseException as error:  # raised in the tracking thread
-            self._searched.finish(error)
-        else:
-            self._searched.finish()
+            pass
+        except BaseException as caught:  # raised in the calling thread after the frames before it
+            error = caught
         finally:
             self.stages["decode"] += time.thread_time()
+            self._queue.finish(error)
+            self._pool.shutdown()
+
+    def _decode(self, reader: Reader) -> None:
+        """Submit the frames to search to the pool, and queue all of them in order."""
+        cuts, skipped, expected = SceneCuts(), 0, None
+        for index, moment, frame in reader:
+            if self.stopped:
+                break
+            cut = cuts.update(frame)
+            skipped += 1
+            missed = index - expected if expected is not None else 0
+            if expected is None or missed or cut or skipped >= self._interval:
+                search, skipped = self._pool.submit(self._search, frame), 0
+            else:
+                search = None
+            kept = frame if self._keeps_frames else None
+            self._queue.put(_QueuedFrame(moment, kept, cut, search, missed))
+            del frame, kept
+            self.missed += missed
+            expected = index + 1
 
     def _search(self, frame: Frame) -> tuple[Any, float]:
         start = time.perf_counter()
         return self._detector.search(frame), time.perf_counter() - start
 
-    def _track_frames(self) -> None:
-        """Track the searched frames, and queue the results of all frames in their order."""
+    def _track_frames(self) -> Iterator[Any]:
+        """Track the searched frames, and yield the results of all frames in their order."""
         waiting: list[_QueuedFrame] = []
         held: deque[_Searched] = deque()
         before = None
-        for item in self._searched:
+        for item in self._queue:
             if item.search is None:
                 waiting.append(item)
                 continue
             held.append(_Searched(waiting, item, self._track(item, waiting)))
             waiting = []
+            del item  # free the frame before waiting for the next one
             if self._delay:
                 results = backfill_results([searched.result for searched in held])
                 for searched, result in zip(held, results, strict=True):
                     searched.result = result
             if len(held) > self._delay:
-                before = self._emit_searched(before, held.popleft())
-            del item  # free the frame before waiting for the next one
-        while held:
-            before = self._emit_searched(before, held.popleft())
-        self._emit_between(before, None, waiting)
+                result = held[0].result
+                yield from self._release(before, held.popleft())
+                before = result
+        for searched in (*held, _Searched(waiting, None, None)):
+            yield from self._release(before, searched)
+            before = searched.result
 
     def _track(self, item: _QueuedFrame, waiting: list[_QueuedFrame]) -> Any:
         """Track a searched frame after the `waiting` ones, which are not searched."""
@@ -387,39 +364,27 @@ class _Pipeline:
         frames = 1 + len(waiting) + item.missed
         return self._detector.track(found, time=item.time, frames=frames, cut=item.cut)
 
-    def _emit_searched(self, before: Any, searched: _Searched) -> Any:
-        """Queue a searched frame after those before it that were not searched; return its result."""
-        self._emit_between(before, searched.result, searched.between)
-        self._emit(searched.item, searched.result)
-        return searched.result
-
-    def _emit_between(self, before: Any, after: Any, waiting: list[_QueuedFrame]) -> None:
-        """Interpolate and queue the results of the `waiting` frames; `after` is None at the end."""
-        if waiting:
-            results = interpolate_results(before, after, [item.time for item in waiting], self._shape)
-            for item, result in zip(waiting, results, strict=True):
-                self._emit(item, result)
-
-    def _emit(self, item: _QueuedFrame, result: Any) -> None:
-        for name, seconds in result.seconds.items():
-            if name != "search":  # measured here, because a detector may omit it
-                self.stages[name] += seconds
-        self._results.put(replace(result, frame=item.frame) if self._keeps_frames else result)
+    def _release(self, before: Any, searched: _Searched) -> Iterator[Any]:
+        """Yield the results of frames between two searched ones, interpolated, and of the second one."""
+        items, results = searched.between, list[Any]()
+        if items:
+            times = [item.time for item in items]
+            results = interpolate_results(before, searched.result, times, self._shape)
+        if searched.item is not None:
+            items, results = [*items, searched.item], [*results, searched.result]
+        for item, result in zip(items, results, strict=True):
+            for name, seconds in result.seconds.items():
+                if name != "search":  # measured here, because a detector may omit it
+                    self.stages[name] += seconds
+            yield replace(result, frame=item.frame) if self._keeps_frames else result
+            item.frame = None
 
 
 class TrackRun(Closing):
     """Results of a source, frame by frame, as `track` returns it: an iterator and a context manager.
 
-    Closing or deleting it ends all processes and threads; nothing is started before the first result.
-
-    Attributes
-    ----------
-    source, info
-        The source, and the properties of its video.
-    detector
-        The detector that finds the vehicles.
-    has_frames
-        Whether the results hold their frames.
+    Closing or deleting it ends all processes and threads; nothing is started before the first result. `info`
+    holds the properties of the source's video, and `has_frames` says whether the results hold their frames.
     """
 
     def __init__(
@@ -436,7 +401,7 @@ class TrackRun(Closing):
     ) -> None:
         self.source, self.info, self.detector, self.has_frames = source, source.info, detector, has_frames
         self._pipeline, self._on_close, self._on_end = pipeline, on_close, contextlib.ExitStack()
-        self._entered = False
+        self._entered = self.stopped = False
         self._first, self._end = span  # the first frame, and the end in seconds
         self._results = pipeline.run()
         self._progress = progress
@@ -489,11 +454,6 @@ class TrackRun(Closing):
         minutes, seconds = divmod(int(frames / self.info.fps), 60)
         return f"{minutes}:{seconds:02d}"
 
-    @property
-    def stopped(self) -> bool:
-        """Whether `stop` has been called."""
-        return self._pipeline.stopped
-
     def sound(self) -> AudioSource | None:
         """Return the sound of the frames; None if there is none."""
         return self.source.audio(self._first, self._end)
@@ -515,6 +475,7 @@ class TrackRun(Closing):
 
     def stop(self) -> None:
         """End the source, from any thread; the frames read so far complete the run."""
+        self.stopped = True
         self._pipeline.stop()
 
     def close(self) -> None:
