@@ -16,7 +16,7 @@ from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.images import write_image
 from vehicle_detection.network import load_network
-from vehicle_detection.scenes import render_scene
+from vehicle_detection.scenes import render_patches, render_scene
 from vehicle_detection.svm import Template, VehicleClassifier
 from vehicle_detection.tables import TrackTable
 
@@ -70,6 +70,18 @@ def random_network(seed=0):
     with tempfile.TemporaryDirectory() as folder:
         write_network(f"{folder}/random.onnx", seed)
         return load_network(f"{folder}/random.onnx")
+
+
+@functools.cache
+def _all_patches():
+    return render_patches(160, random_state=7)
+
+
+def rendered_patches(count):
+    """Return patches and labels, vehicles first: the same ones in all tests, rendered once."""
+    patches, labels = _all_patches()
+    rows = np.r_[: (count + 1) // 2, 80 : 80 + count // 2]
+    return patches[rows], labels[rows]
 
 
 @functools.cache

@@ -7,13 +7,14 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
 import vehicle_detection.course as lesson
+from tests.helpers import rendered_patches
 from tests.video.clips import write_clip
 from vehicle_detection.course import HeatmapDetector, extract_features, find_car_windows
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, evaluate_detections
 from vehicle_detection.formats import read_labels
-from vehicle_detection.scenes import render_patches, render_scene
+from vehicle_detection.scenes import render_scene
 from vehicle_detection.tables import TrackTable
 from vehicle_detection.video import process_video
 
@@ -22,7 +23,7 @@ FEATURES = {"spatial_size": (16, 16), "hist_bins": 16, "divide_by": 1}
 
 @pytest.fixture(scope="module")
 def patches():
-    return render_patches(80)
+    return rendered_patches(80)
 
 
 @pytest.fixture(scope="module", params=[LinearSVC(random_state=0), GaussianNB()], ids=["svm", "bayes"])

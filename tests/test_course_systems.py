@@ -19,8 +19,9 @@ from sklearn.tree import DecisionTreeClassifier
 
 import vehicle_detection.course
 from tests import lesson_reference
+from tests.helpers import rendered_patches
 from vehicle_detection import write_image
-from vehicle_detection.scenes import render_patches, render_scene
+from vehicle_detection.scenes import render_scene
 
 # The kernels compute HOG in float32, scikit-image in float64: values up to 1.
 FEATURE_TOLERANCE = 5e-6
@@ -30,7 +31,7 @@ FEATURE_TOLERANCE = 5e-6
 def data(tmp_path_factory):
     """File names of patches as PNG and JPEG, vehicles first, and four uint8 frames."""
     folder = tmp_path_factory.mktemp("data")
-    patches, labels = render_patches(80, random_state=11)
+    patches, labels = rendered_patches(80)
     names = {"png": ([], []), "jpg": ([], [])}
     for index, (patch, vehicle) in enumerate(zip(patches, labels)):
         for suffix, (cars, notcars) in names.items():

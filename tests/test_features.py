@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.feature_cases import BLANK, PATCHES
+from tests.helpers import rendered_patches
 from vehicle_detection._kernels import bin_of_value, degree_bounds, orientation_cotangents, sqrt_gradients
 from vehicle_detection._kernels import features as kernels
 from vehicle_detection.errors import InvalidInputError
@@ -28,7 +29,6 @@ from vehicle_detection.features import (
     sum_blocks,
 )
 from vehicle_detection.images import decode_image, write_image
-from vehicle_detection.scenes import render_patches
 
 PRESETS = sorted(FeatureParams.PRESETS)
 # The kernels work in float32, the reference in float64; HOG values lie in 0-1.
@@ -145,7 +145,7 @@ def test_any_parameters_equal_the_reference(params, row, seed):
 
 
 def test_drawn_patches_equal_the_reference():
-    patches, _ = render_patches(12, random_state=3)
+    patches, _ = rendered_patches(12)
     for preset in PRESETS:
         assert_equals_the_reference(patches, FeatureParams.preset(preset))
 

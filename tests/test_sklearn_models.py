@@ -24,13 +24,18 @@ SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, ho
 
 
 @pytest.fixture(scope="module")
-def patches():
-    return render_patches(80, random_state=1)[0]
+def rendered():
+    return render_patches(80, random_state=1)
 
 
 @pytest.fixture(scope="module")
-def labels():
-    return render_patches(80, random_state=1)[1]
+def patches(rendered):
+    return rendered[0]
+
+
+@pytest.fixture(scope="module")
+def labels(rendered):
+    return rendered[1]
 
 
 def test_from_an_own_pipeline(patches, labels):

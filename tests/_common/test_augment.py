@@ -2,13 +2,13 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.helpers import rendered_patches
 from vehicle_detection._common import blur_patches, degrade_patches
-from vehicle_detection.scenes import render_patches
 
 
 @pytest.fixture(scope="module")
 def patches():
-    return render_patches(24, random_state=2)[0]
+    return rendered_patches(24)[0]
 
 
 def sharpness(images):

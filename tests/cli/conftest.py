@@ -2,9 +2,10 @@
 
 import pytest
 
+from tests.helpers import rendered_patches
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.images import write_image
-from vehicle_detection.scenes import render_drive, render_patches
+from vehicle_detection.scenes import render_drive
 
 
 @pytest.fixture(scope="module")
@@ -14,7 +15,7 @@ def material(tmp_path_factory):
     drive = render_drive(frames=10, shape=(270, 480), scenario="overtaking")
     draw_clip(drive, folder / "clip.mp4", folder / "labels.csv")
     write_image(folder / "road.png", drive[6].image)
-    patches, labels = render_patches(40, random_state=3)
+    patches, labels = rendered_patches(40)
     for number, (patch, label) in enumerate(zip(patches, labels)):
         home = folder / ("vehicles" if label else "non-vehicles") / "drawn"
         home.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from tests.cli.commands import failing, finish, run, start_changed
-from tests.helpers import ROOT
+from tests.helpers import ROOT, rendered_patches
 from tests.video.clips import gray_frames, write_clip
 from vehicle_detection import detector, drive, tables, video
 from vehicle_detection._common import files
@@ -26,7 +26,7 @@ from vehicle_detection.drive import event_files, events
 from vehicle_detection.errors import OutputError
 from vehicle_detection.formats import write
 from vehicle_detection.images import write_image
-from vehicle_detection.scenes import render_patches, render_scene
+from vehicle_detection.scenes import render_scene
 from vehicle_detection.video import probe_video
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
@@ -154,7 +154,7 @@ def test_an_interrupt_after_a_command_changes_nothing():
 
 def test_an_interrupt_does_not_wait_for_threads_that_compute(tmp_path):
     """Python joins the threads of an executor when it exits, also if their thread was abandoned."""
-    patches, labels = render_patches(4)
+    patches, labels = rendered_patches(4)
     for name, label in (("vehicles", True), ("others", False)):
         (tmp_path / name / "drawn").mkdir(parents=True)
         for row in np.flatnonzero(labels == label):

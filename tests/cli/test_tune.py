@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from tests.cli import commands
+from tests.helpers import rendered_patches
 from vehicle_detection.images import read_image, write_image
-from vehicle_detection.scenes import render_patches, render_scene, write_labels
+from vehicle_detection.scenes import render_scene, write_labels
 from vehicle_detection.training import read_results, trials
 
 SMALL = "spatial_size=8 hist_bins=8 pix_per_cell=16 hog_channel=0 mirror=no"
@@ -20,7 +21,7 @@ def run(*words):
 def material(tmp_path_factory):
     """Return a folder with patches of both classes, and a frame with its labels."""
     folder = tmp_path_factory.mktemp("material")
-    patches, labels = render_patches(80)
+    patches, labels = rendered_patches(80)
     for row, (patch, label) in enumerate(zip(patches, labels)):
         home = folder / ("vehicles" if label else "non-vehicles") / "drawn"
         home.mkdir(parents=True, exist_ok=True)

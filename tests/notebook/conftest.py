@@ -2,8 +2,8 @@ import matplotlib
 import matplotlib.pyplot as plt
 import pytest
 
+from tests.helpers import rendered_patches
 from vehicle_detection.datasets import PatchSet
-from vehicle_detection.scenes import render_patches
 
 
 @pytest.fixture(autouse=True)
@@ -17,7 +17,7 @@ def unchanged_settings():
 
 @pytest.fixture(scope="package")
 def patch_set():
-    patches, labels = render_patches(40, random_state=3)
+    patches, labels = rendered_patches(40)
     folders = {True: "vehicles/Far", False: "non-vehicles/Road"}
     names = [f"{folders[bool(label)]}/{number}.png" for number, label in enumerate(labels)]
     return PatchSet(patches, labels, names)

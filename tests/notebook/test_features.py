@@ -1,13 +1,12 @@
 import numpy as np
 import pytest
 
-from tests.helpers import random_classifier
+from tests.helpers import random_classifier, rendered_patches
 from tests.notebook.helpers import SMALL, legend, new_axes, texts, titles
 from vehicle_detection import notebook
 from vehicle_detection.features import FeatureParams, extract_features, hog_image
 from vehicle_detection.notebook.features import add_glyphs
 from vehicle_detection.notebook.style import OTHER, VEHICLE
-from vehicle_detection.scenes import render_patches
 from vehicle_detection.svm import Template, VehicleClassifier
 
 
@@ -43,7 +42,7 @@ def test_channels_of_two_classes_are_plotted_separately(patch_set):
 
 
 def test_hog_has_a_panel_per_channel_and_cell_size():
-    patches, _ = render_patches(2, random_state=1)
+    patches, _ = rendered_patches(2)
     figure = notebook.plot_hog({"car": patches[0], "road": patches[1]}, SMALL, pix_per_cell=[8, 16, 32])
     assert len(figure.axes) == 4 * 6
     assert titles(figure)[:6] == [

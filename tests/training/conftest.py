@@ -1,18 +1,18 @@
 import numpy as np
 import pytest
 
-from tests.helpers import random_classifier
+from tests.helpers import random_classifier, rendered_patches
 from tests.training.trial_cases import SMALL
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.features import FeatureParams
-from vehicle_detection.scenes import render_patches, render_scene
+from vehicle_detection.scenes import render_scene
 from vehicle_detection.tables import TrackTable
 
 
 @pytest.fixture(scope="package")
 def patch_set():
-    patches, labels = render_patches(120)
+    patches, labels = rendered_patches(120)
     sources = ("vehicles/GTI_Far", "vehicles/KITTI_extracted"), ("non-vehicles/GTI", "non-vehicles/Extras")
     names = [f"{sources[not label][row % 2]}/{row}.png" for row, label in enumerate(labels)]
     return PatchSet(patches, labels, names)

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from tests.helpers import rendered_patches
 from vehicle_detection.datasets import (
     PatchSet,
     load_training_patches,
@@ -15,7 +16,6 @@ from vehicle_detection.datasets import (
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, extract_features
-from vehicle_detection.scenes import render_patches
 from vehicle_detection.svm import load_classifier
 from vehicle_detection.training import (
     SPLITS,
@@ -42,7 +42,7 @@ def named(patches, labels, sources):
 
 @pytest.fixture(scope="module")
 def patch_set():
-    return named(*render_patches(160, random_state=7), SOURCES)
+    return named(*rendered_patches(160), SOURCES)
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +148,7 @@ def test_fitting_does_not_change_the_features(patch_set):
 
 
 def test_impossible_splits_are_skipped():
-    patches, labels = render_patches(24)
+    patches, labels = rendered_patches(24)
     own = named(patches, labels, {True: ("mine", "mine"), False: ("other", "other")})
     _, report = train_and_evaluate(own, params=SMALL, seeds=1)
     assert set(report.splits) == {"random", "sequences"}
@@ -163,7 +163,7 @@ def test_impossible_splits_are_skipped():
 
 
 def test_a_split_with_one_class_is_skipped():
-    patches, labels = render_patches(24)
+    patches, labels = rendered_patches(24)
     # All vehicles are alone in their folders: the split by sequences tests on the others only.
     names = [f"{number}/1.png" if label else f"others/{number}.png" for number, label in enumerate(labels)]
     _, report = train_and_evaluate(PatchSet(patches, labels, names), params=SMALL, seeds=1)
@@ -222,7 +222,7 @@ def test_the_card_holds_data_license_accuracy_and_limitations(trained):
 
 
 def test_the_card_of_own_patches_does_not_mention_the_course():
-    own = named(*render_patches(24), {True: ("mine", "mine"), False: ("other", "other")})
+    own = named(*rendered_patches(24), {True: ("mine", "mine"), False: ("other", "other")})
     classifier, report = train_and_evaluate(own, params=SMALL, seeds=1, options=TrainingOptions(mirror=False))
     text = model_card(classifier, report)
     for word in ("GTI", "KITTI", "Extras", "CC BY", "```", "Other features"):

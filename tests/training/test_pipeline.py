@@ -10,9 +10,9 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
 from tests.feature_cases import PATCHES
+from tests.helpers import rendered_patches
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, extract_features
-from vehicle_detection.scenes import render_patches
 from vehicle_detection.training import PatchFeatures
 
 
@@ -143,7 +143,7 @@ def test_the_transformer_leaves_its_input_alone_and_can_be_pickled():
 
 
 def test_the_transformer_in_cross_validation():
-    patches, labels = render_patches(40, random_state=5)
+    patches, labels = rendered_patches(40)
     features = PatchFeatures(spatial_size=8, orient=6, hog_channel=0, n_jobs=1)
     pipeline = make_pipeline(features, StandardScaler(), LinearSVC(C=1e-3, random_state=0))
     assert cross_val_score(pipeline, patches, labels, cv=4, error_score="raise").mean() >= 0.9
