@@ -18,7 +18,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 import vehicle_detection as vd
-from vehicle_detection.scenes import SceneVehicle
+from vehicle_detection.scenes import SceneVehicle, truth_table
 
 Image = NDArray[np.uint8]
 
@@ -175,14 +175,7 @@ def _subsample(name: str, count: int) -> vd.LabelledFrames:
 
 def _label(name: str, rendered: Sequence[Any]) -> vd.LabelledFrames:
     """Combine rendered scenes and their true boxes."""
-    rows = [(number, row) for number, scene in enumerate(rendered) for row in scene.truth]
-    labels = vd.TrackTable(
-        [number for number, _ in rows],
-        np.array([row.track for _, row in rows], int),
-        np.array([row.box for _, row in rows], float).reshape(-1, 4),
-        ignore=np.array([row.ignore for _, row in rows], bool),
-        frame_keys=range(len(rendered)),
-    )
+    labels = truth_table({number: scene.truth for number, scene in enumerate(rendered)})
     return vd.LabelledFrames(name, [scene.image for scene in rendered], labels)
 
 
@@ -199,16 +192,13 @@ class Clip:
     end
         Number of seconds to process.
     labels
-        The true boxes.
-    truth
-        The same; for a rendered drive with distances and speeds.
+        The true boxes; for a rendered drive with distances and speeds.
     """
 
     path: Path
     horizon: float
     end: float
     labels: vd.TrackTable
-    truth: Any
 
 
 def clip(folder: str | os.PathLike[str], frames: int = 50) -> Clip:
@@ -218,16 +208,14 @@ def clip(folder: str | os.PathLike[str], frames: int = 50) -> Clip:
         path = DATA / "videos" / "project_clip.mp4"
         fps = float(vd.probe_video(path).fps)
         labels = labels[labels["frame"] < frames]
-        return Clip(path, 0.58, frames / fps, labels, labels)
+        return Clip(path, 0.58, frames / fps, labels)
     from moviepy import ImageSequenceClip
 
     drive = vd.render_drive(frames=frames, shape=(540, 960))
-    path, table = Path(folder) / "drive.mp4", Path(folder) / "truth.csv"
+    path = Path(folder) / "drive.mp4"
     video = ImageSequenceClip([scene.image for scene in drive], fps=drive.fps)
     video.write_videofile(str(path), preset="veryfast", audio=False, logger=None)
-    drive.write_labels(table)
-    end = frames / drive.fps
-    return Clip(path, SYNTHETIC_HORIZON, end, vd.read_labels(table), drive.truth)
+    return Clip(path, SYNTHETIC_HORIZON, frames / drive.fps, drive.labels)
 
 
 def zoom(figure: Any, top: float = 0.45, bottom: float = 0.82) -> Any:

@@ -6,7 +6,6 @@ from matplotlib.figure import Figure
 
 from tests.notebook.helpers import gray_image, titles
 from vehicle_detection import Explanation
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.notebook import plot_explanation
 
 CELLS = np.array([[0.5, -1.0, 0.0], [0.25, 0.0, 1.0]])
@@ -46,8 +45,3 @@ def test_a_given_figure_is_used_and_nothing_found_is_said():
     empty = explanation(score=None, found=False, cells=np.zeros((2, 3)), terms={"cells": 0.0})
     assert plot_explanation(gray_image(), empty, figure=figure) is figure
     assert titles(figure)[0] == "not found"
-
-
-def test_bad_arguments_are_refused():
-    with pytest.raises(InvalidInputError, match="explanation must be an Explanation, got 1"):
-        plot_explanation(gray_image(), 1)

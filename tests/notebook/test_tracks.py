@@ -1,14 +1,12 @@
 from fractions import Fraction
 
 import numpy as np
-import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 
 from tests.notebook.helpers import legend, new_axes, texts
 from vehicle_detection import notebook
 from vehicle_detection.boxes import Detections
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.notebook.style import COLORS
 from vehicle_detection.scenes import render_drive
 from vehicle_detection.tables import TrackTable
@@ -70,14 +68,8 @@ def test_frames_may_have_times_and_short_tracks_are_left_out():
 
 def test_tracks_of_a_file_are_compared_with_the_truth_of_a_drive():
     drive = render_drive(frames=30, shape=(180, 320), scenario="overtaking", random_state=3)
-    rows = [(frame, row) for frame, rows in enumerate(drive.truth) for row in rows if not row.ignore]
-    labels = TrackTable(
-        [frame for frame, _ in rows],
-        np.array([row.track for _, row in rows]),
-        np.array([row.box for _, row in rows]),
-        distance_m=np.array([row.distance_m for _, row in rows]),
-    )
-    figure = notebook.plot_tracks(labels, truth=drive.truth)
+    labels = drive.labels[~drive.labels["ignore"]]
+    figure = notebook.plot_tracks(labels, truth=drive.labels)
     count = len(set(labels["track_id"].tolist()))
     assert len(figure.axes[0].lines) == 2 * count
     found, true = figure.axes[2].lines[0], figure.axes[2].lines[count]
@@ -89,31 +81,6 @@ def test_tracks_of_a_file_are_compared_with_the_truth_of_a_drive():
     ignored = TrackTable([0, 1], [1, 2], [[0, 0, 9, 9]] * 2, ignore=[False, True])
     both = notebook.plot_tracks(labels, truth=ignored)
     assert len(both.axes[0].lines) == count + 1
-
-
-@pytest.mark.parametrize(
-    ("results", "options", "message"),
-    [
-        ([], {}, "results must hold at least one track to plot, got none"),
-        ([result(0, track(1, 1.0, shown=False))], {}, "results must hold at least one track to plot"),
-        ([3], {}, "results must be a FrameResult, got 3;"),
-        (3, {}, "results must be the FrameResult of each frame, or TrackTable; got 3"),
-        (
-            TrackTable(["a"], [1], [[0, 0, 9, 9]]),
-            {},
-            "results must have numbered frames, got names such as 'a'",
-        ),
-        (
-            [result(0, track(1, 1.0))],
-            {"truth": "t.csv"},
-            "truth must be TrackTable or the truth of a rendered drive",
-        ),
-        ([result(0, track(1, 1.0))], {"fps": 0}, "fps must be a number, greater than 0"),
-    ],
-)
-def test_malformed_tracks_are_rejected(results, options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        notebook.plot_tracks(results, **options)
 
 
 REPORT = VideoReport(
@@ -135,17 +102,3 @@ def test_stage_times_of_a_report_and_of_results():
     assert {"  22.5 ms", "  11.0 ms"} <= set(texts(axes.texts))
     assert axes.get_xlabel() == "work (ms per frame)"
     assert texts(notebook.plot_stage_times(REPORT, ax=new_axes()).get_yticklabels()) == [""]
-
-
-@pytest.mark.parametrize(
-    ("runs", "message"),
-    [
-        ({}, "runs must hold at least one run; got none"),
-        ([], "runs must have at least one frame each"),
-        ("fast", "runs must be a VideoReport or a list of FrameResult"),
-        ({"a": [1]}, "runs must be a VideoReport or a list of FrameResult"),
-    ],
-)
-def test_malformed_runs_are_rejected(runs, message):
-    with pytest.raises(InvalidInputError, match=message):
-        notebook.plot_stage_times(runs)

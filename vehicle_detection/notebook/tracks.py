@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,8 +13,7 @@ from vehicle_detection._common import Floats, check_number, check_type, describe
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.notebook import style
 from vehicle_detection.notebook.style import COLORS, LINESTYLES, YELLOW, FigureLike
-from vehicle_detection.scenes import VehicleTruth
-from vehicle_detection.tables import NO_TRACK, TrackTable
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.tracking import FrameResult
 from vehicle_detection.video import VideoReport
 
@@ -39,14 +38,10 @@ _LEGEND_ROWS = 38
 _STAGES = ("decode", "search", "regions", "track", "draw", "encode")
 
 
-# Number and time of a track in a frame, its box, distance and speed, and their standard errors.
-Row = tuple[int, float, Any, float | None, float | None, float | None, float | None]
-
-
 def plot_tracks(
     results: Iterable[FrameResult] | TrackTable,
     *,
-    truth: TrackTable | Sequence[Sequence[VehicleTruth]] | None = None,
+    truth: TrackTable | None = None,
     fps: float = 25.0,
     min_frames: int = 1,
     figure: FigureLike | None = None,
@@ -61,7 +56,7 @@ def plot_tracks(
         The detector's result of each frame, whose shown tracks are plotted; or the boxes of a tracks file
         with numbered frames, as `read_labels` returns.
     truth
-        True boxes, drawn as black dots: labels, or the ``truth`` of a rendered drive, which includes
+        True boxes, drawn as black dots: labels, such as the ``labels`` of a rendered drive, which include
         distances and speeds. Ignored boxes are left out.
     fps, min_frames
         Frame rate, for frames without a time; and number of frames below which a track is left out.
@@ -75,11 +70,9 @@ def plot_tracks(
     """
     rate = check_number(fps, "fps", above=0, high=1e6)
     shortest = check_number(min_frames, "min_frames", low=1)
-    if isinstance(results, TrackTable):
-        tracks = _split_tracks(_rows_of_boxes(results, rate, "results"))
-    else:
-        tracks = _split_tracks(_rows_of_results(results, rate))
-    tracks = {number: columns for number, columns in tracks.items() if columns.shape[1] >= shortest}
+    table = results if isinstance(results, TrackTable) else TrackTable.from_results(results)
+    found = _columns_by_track(table, "results", rate)
+    tracks = {number: columns for number, columns in found.items() if columns.shape[1] >= shortest}
     if not tracks:
         raise InvalidInputError(
             "results must hold at least one track to plot, got none; pass results with shown tracks"
@@ -96,7 +89,9 @@ def plot_tracks(
             if not np.isnan(stds).all():
                 panel.fill_between(time, values - stds, values + stds, color=color, alpha=0.25, linewidth=0)
     if truth is not None:
-        for index, (time, *columns) in enumerate(_split_tracks(_rows_of_truth(truth, rate)).values()):
+        check_type(truth, "truth", TrackTable, "read a file with read_labels or pass drive.labels")
+        true = _columns_by_track(truth[~truth["ignore"]], "truth", rate)
+        for index, (time, *columns) in enumerate(true.values()):
             for panel, values in zip(grid.flat, columns):
                 panel.plot(time, values, "k.", markersize=2, label=None if index else "truth")
     for panel, label in zip(grid.flat, _LABELS):
@@ -111,59 +106,21 @@ def plot_tracks(
     return figure
 
 
-def _rows_of_results(results: object, rate: float) -> Iterator[Row]:
-    if not isinstance(results, Iterable):
+def _columns_by_track(table: TrackTable, name: str, rate: float) -> dict[int, Floats]:
+    """``(9, N)`` columns of each track: time, the values of the panels, and their standard errors."""
+    if any(isinstance(key, str) for key in table.frame_keys):
         raise InvalidInputError(
-            f"results must be the FrameResult of each frame, or TrackTable; got {describe(results)}; "
-            "collect what detector.process returns"
-        )
-    for result in results:
-        check_type(result, "results", FrameResult, "collect what detector.process returns")
-        time = result.index / rate if result.time is None else result.time
-        for track in result.shown:
-            stds = track.distance_std_m, track.speed_std_mps
-            yield track.id, time, track.box, track.distance_m, track.speed_mps, *stds
-
-
-def _rows_of_boxes(labels: TrackTable, rate: float, name: str) -> Iterator[Row]:
-    if any(isinstance(key, str) for key in labels.frame_keys):
-        raise InvalidInputError(
-            f"{name} must have numbered frames, got names such as {labels.frame_keys[0]!r}; "
+            f"{name} must have numbered frames, got names such as {table.frame_keys[0]!r}; "
             "convert them with TrackTable.renamed"
         )
-    tracks, distances, speeds = (labels[column] for column in ("track_id", "distance_m", "speed_mps"))
-    times = labels["frame"] / rate
-    for row in np.argsort(times, kind="stable"):
-        if tracks[row] != NO_TRACK:
-            yield tracks[row], times[row], labels.boxes[row], distances[row], speeds[row], None, None
-
-
-def _rows_of_truth(truth: object, rate: float) -> Iterator[Row]:
-    """Rows of the true boxes that are not ignored, from labels or the truth of a rendered drive."""
-    if isinstance(truth, TrackTable):
-        yield from _rows_of_boxes(truth[~truth["ignore"]], rate, "truth")
-        return
-    given = isinstance(truth, Sequence) and all(isinstance(each, Sequence) for each in truth)
-    frames: Any = truth if given else [[truth]]
-    for frame, rows in enumerate(frames):
-        for row in rows:
-            if not isinstance(row, VehicleTruth):
-                raise InvalidInputError(
-                    f"truth must be TrackTable or the truth of a rendered drive, got {describe(truth)}; "
-                    "read a file with read_labels or pass drive.truth"
-                )
-            if not row.ignore:
-                yield row.track, frame / rate, row.box, row.distance_m, row.speed_mps, None, None
-
-
-def _split_tracks(rows: Iterable[Row]) -> dict[int, Floats]:
-    """``(9, N)`` columns of each track: time, the values of the panels, and their standard errors."""
-    table = [
-        (number, time, (box[0] + box[2]) / 2, box[2] - box[0], distance, speed, None, None, *stds)
-        for number, time, box, distance, speed, *stds in rows
-    ]
-    columns = np.array(table, np.float64).reshape(-1, 10).T  # None becomes NaN
-    return {int(number): columns[1:, columns[0] == number] for number in np.unique(columns[0])}
+    times, tracks = table.times(), {}
+    for number, rows in sorted(table.by_track().items()):
+        frames, (left, _, right, _) = rows["frame"].astype(int), rows.boxes.T
+        unknown = np.full(len(rows), np.nan)
+        columns = [frames / rate if times is None else times[frames], (left + right) / 2, right - left]
+        columns += [rows["distance_m"], rows["speed_mps"], unknown, unknown]
+        tracks[number] = np.stack([*columns, rows["distance_std_m"], rows["speed_std_mps"]])
+    return tracks
 
 
 def _insert_gaps(columns: Floats, rate: float) -> Floats:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -20,6 +20,7 @@ from vehicle_detection.scenes.scene import RandomState, Scene, SceneRenderer, ma
 from vehicle_detection.scenes.scenery import LANE, Road
 from vehicle_detection.scenes.shapes import random_appearance
 from vehicle_detection.scenes.vehicles import VehicleBody
+from vehicle_detection.tables import FrameKey, TrackTable
 
 SCENARIOS = (
     "highway", "overtaking", "crossing", "occlusion", "traffic", "passing", "closing", "cut_in", "empty",
@@ -206,6 +207,11 @@ class Drive:
         """Ground truth of every frame, computed without rendering the images."""
         return tuple(self.truth_of(frame) for frame in range(self._frames))
 
+    @cached_property
+    def labels(self) -> TrackTable:
+        """Ground truth of every frame as a table; see `truth_table`."""
+        return truth_table(dict(enumerate(self.truth)))
+
     def truth_of(self, index: int) -> tuple[VehicleTruth, ...]:
         """Ground truth of frame `index`, computed without rendering the image."""
         return self._renderer.truth(*self._state(self._check_index(index)))
@@ -278,6 +284,19 @@ def render_drive(
     margin = check_integer(pitch_jitter_px, "pitch_jitter_px", low=0, high=50)
     config = SceneView(**view).configure(rng, margin)
     return Drive(config, *make_traffic(scenario, frames / fps, rng), frames=frames, fps=fps)
+
+
+def truth_table(frames: Mapping[FrameKey, Sequence[VehicleTruth]]) -> TrackTable:
+    """Return the ground truth of frames, by number or file name, as labels with distances and speeds."""
+    rows = [(key, row) for key, found in frames.items() for row in found]
+    columns = {
+        name: [getattr(row, name) for _, row in rows]
+        for name in ("occluded", "truncated", "distance_m", "speed_mps")
+    }
+    columns["ignore"] = [bool(row.ignore) for _, row in rows]
+    boxes = np.array([row.box for _, row in rows], np.float64).reshape(-1, 4)
+    tracks = [row.track for _, row in rows]
+    return TrackTable([key for key, _ in rows], tracks, boxes, frame_keys=tuple(frames), **columns)
 
 
 def write_labels(
