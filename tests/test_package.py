@@ -30,7 +30,6 @@ ALLOWED = {
 }
 # Folders on their way to a ring.
 MOVING = {}
-KNOWN_UPWARD = {("notebook", "scenes")}
 
 HEAVY = {"matplotlib", "moviepy", "sklearn", "pandas", "pooch", "jinja2", "dask", "pyarrow", "motmetrics"}
 HEAVY |= {"ipywidgets", "IPython"}
@@ -112,7 +111,7 @@ def test_a_module_imports_its_own_ring_and_the_core_through_interfaces(name):
             continue
         ring, other_ring = ring_of(name), ring_of(other)
         if ring != other_ring and other_ring not in ("core", "training"):
-            assert (ring, other_ring) in ALLOWED or (package_of(name), other_ring) in KNOWN_UPWARD
+            assert (ring, other_ring) in ALLOWED
         if ring_of(name) != ring_of(other) or ring == "core":
             assert "." not in other.removesuffix(".__init__"), f"{name} imports {other}, not its package"
 
