@@ -114,7 +114,7 @@ class SideOutputs:
         if options.srt is not None:
             units = detector.annotator.style.units
             with option_names(path="--srt"):
-                own = detector.annotator.own_speed
+                own: Any = detector.annotator.own_speed
                 write_subtitles(table, options.srt, fps=fps, events=events, own_speed=own, units=units)
         if self._page is not None:
             pictures = self._explain(detector) if options.why else []
@@ -131,7 +131,7 @@ class SideOutputs:
         from vehicle_detection.drive import find_events, own_speeds
 
         table, fps, speeds = self._table, float(done.fps), None
-        own = detector.annotator.own_speed
+        own: Any = detector.annotator.own_speed
         if own is not None:
             speeds = own_speeds(own, table, fps=fps)
             unknown = float(np.isnan(speeds).mean()) if len(speeds) else 0.0

@@ -139,12 +139,8 @@ def update_distances(
     # of the length to first order.
     side = lateral_px / width_scale
     innovation = np.log(sides[:, 0] / width_scale) - mean[:, 2] - side * mean[:, 3] + np.log(mean[:, 0])
-    # Detectors cut the long sides of vehicles short, where the whole box would be wider than usual.
-    aspect = width_scale / (camera.focal_px * camera.vehicle_height_m)
-    cut_short = np.log(np.maximum(aspect / _MAX_ASPECT, 1.0))
-    covered_std = np.where(measured.covered > 0, _COVERED_STD, 0.0)
-    side_std = side * camera.vehicle_length_std_m
-    systematic = np.square(cut_short) + np.square(covered_std) + np.square(side_std)
+    systematic = _width_variance(measured, camera, width_scale, side)
+    # Both edges are measured with the same error.
     variance = np.square(edge_std[:, 0] / sides[:, 0]) * 2 * box_frames + systematic * pitch_frames
     jacobian[:, 0], jacobian[:, 2], jacobian[:, 3] = -1 / mean[:, 0], 1.0, side
     variance = np.where(width_visible & ~(is_bound & (innovation < 0)), variance, np.inf)
@@ -155,12 +151,32 @@ def update_distances(
     return states._replace(range_mean=mean, range_cov=cov)
 
 
+def _width_variance(measured: Measurements, camera: Camera, width_scale: Floats, side: Floats) -> Floats:
+    """Variance of the logarithm of boxes' widths that more frames do not average out, ``(N,)``.
+
+    `width_scale` is the width in pixels times the distance, and `side` the part of it that a meter of the
+    vehicle's length adds.
+    """
+    # Detectors cut the long sides of vehicles short, where the whole box would be wider than usual.
+    aspect = width_scale / (camera.focal_px * camera.vehicle_height_m)
+    cut_short = np.log(np.maximum(aspect / _MAX_ASPECT, 1.0))
+    covered_std = np.where(measured.covered > 0, _COVERED_STD, 0.0)
+    side_std = side * camera.vehicle_length_std_m
+    return np.asarray(np.square(cut_short) + np.square(covered_std) + np.square(side_std))
+
+
 def _scalar_update(
     mean: Floats, cov: Floats, jacobian: Floats, innovation: Floats, variance: Floats
 ) -> tuple[Floats, Floats]:
-    """Correct each state by one scalar measurement; an infinite variance changes nothing."""
-    cross = (cov @ jacobian[:, :, None])[:, :, 0]
-    expected = (jacobian * cross).sum(axis=1)
+    """Correct each state by one scalar measurement; an infinite variance changes nothing.
+
+    `mean` and `jacobian` are ``(N, 4)``, `cov` ``(N, 4, 4)``, `innovation` and `variance` ``(N,)``. With one
+    measurement the innovation's covariance ``h P h' + r`` is a number, so that no matrix is inverted. The
+    variance `r` of an outlier is increased by the square of its innovation in units of `_OUTLIER` standard
+    errors (Huber's weights).
+    """
+    cross = (cov @ jacobian[:, :, None])[:, :, 0]  # P h'
+    expected = (jacobian * cross).sum(axis=1)  # h P h'
     penalty = np.maximum(np.square(innovation) / (expected + variance) / _OUTLIER**2, 1.0)
     gain = cross / (expected + variance * penalty)[:, None]
     return mean + gain * innovation[:, None], cov - gain[:, :, None] * cross[:, None, :]

@@ -109,7 +109,9 @@ class HorizonFilter:
         camera, mean_std = self.prior_camera, self._mean_slope_std
         vehicle_variance = max(self._slope_std**2 - mean_std**2, 1e-12)
         n, x, xx, y, xy = self._sums.T
-        # Information of each line about (horizon, mean slope), with its own part of the slope integrated out.
+        # A vehicle's line is bottom = horizon + (slope + own) * width, where `own` has the vehicle variance.
+        # Its normal equations in (horizon, slope, own) are the weighted sums; eliminating `own` (the Schur
+        # complement) subtracts the products with `factor` and leaves 2x2 equations, which add up.
         factor = 1 / (xx + 1 / vehicle_variance)
         crossed = (x - x * xx * factor).sum()
         information = np.array(

@@ -212,6 +212,7 @@ def initiate(boxes: Floats, edge_std: Floats) -> tuple[Floats, Floats]:
 
 def predict(mean: Floats, cov: Floats, dt: float, noise_density: Floats) -> tuple[Floats, Floats]:
     """Predict states by `dt` seconds; a velocity gains the variance `noise_density` ``(N, 4)`` per second."""
+    # State [box | velocity]: box += dt * velocity. The noise is white acceleration, integrated over dt.
     transition = np.kron([[1, dt], [0, 1]], np.eye(4))
     noise = np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(4))
     predicted = mean @ transition.T
@@ -236,7 +237,9 @@ def update(
     one side, the track is wrong: the variances of that edge's position and of its velocity during the last
     `dt` seconds are increased instead.
     """
-    cross = cov[:, :, :4] @ _TO_EDGES.T  # cov @ H.T, because H is zero for the velocities
+    # The measurement matrix H, (4, 8), is [_TO_EDGES | 0]: edges do not depend on the velocities. So P H' is
+    # (N, 8, 4) and H P H' is (N, 4, 4).
+    cross = cov[:, :, :4] @ _TO_EDGES.T
     innovation_cov = _TO_EDGES @ cross[:, :4]
     innovation = edges - boxes_from_states(mean)
     normalized = innovation / np.sqrt(innovation_cov[:, _DIAGONAL, _DIAGONAL] + variance)
@@ -255,11 +258,12 @@ def update(
     penalty = np.where(persistent, 1.0, np.maximum(np.square(normalized / _OUTLIER), 1.0))
     rejected = reject_outliers[:, None] & (penalty > 1)
     noise = np.where(rejected, UNKNOWN, np.minimum(variance * penalty, UNKNOWN))
-    innovation_cov[:, _DIAGONAL, _DIAGONAL] += noise
+    innovation_cov[:, _DIAGONAL, _DIAGONAL] += noise  # the edges' errors R are independent
     gain = np.linalg.solve(innovation_cov, cross.transpose(0, 2, 1)).transpose(0, 2, 1)
     corrected = mean + (gain @ innovation[:, :, None])[:, :, 0]
     corrected[:, 2:4] = np.maximum(corrected[:, 2:4], _MIN_SIZE)
     cov = cov - gain @ cross.transpose(0, 2, 1)
+    # Rounding errors must not make the covariances asymmetric.
     return corrected, (cov + cov.transpose(0, 2, 1)) / 2, innovation_mean
 
 
