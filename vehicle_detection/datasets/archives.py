@@ -332,8 +332,7 @@ def _download(address: str, part: Path, progress: bool) -> None:
     try:
         download(address, str(part), None)
     except requests.HTTPError as error:
-        assert error.response is not None
-        status = error.response.status_code
+        status = getattr(error.response, "status_code", "an error")
         raise DatasetError(
             f"{address} returns {status}; pass the url of a folder with {' and '.join(ARCHIVES)}"
         ) from error
