@@ -95,12 +95,11 @@ def test_defaults_are_those_of_the_library(monkeypatch, material, tmp_path):
 
     monkeypatch.setattr(training, "train_and_evaluate", note)
     refuse("train", *patches_of(material), "-o", tmp_path / "m.safetensors")
-    assert given["C"] == training.DEFAULT_C
     assert given["params"] == load_classifier().params
-    assert (given["mirror"], given["random_state"], given["split"]) == (True, 0, "random")
+    assert given["split"] == "random"
     recipe = load_classifier().metadata["training"]
     for name in ("C", "gamma", "degraded", "mirror", "random_state"):
-        assert given[name] == recipe[name], name
+        assert getattr(given["options"], name) == recipe[name], name
 
 
 def test_fetch_prints_the_paths_of_the_patches(monkeypatch, tmp_path):
