@@ -8,7 +8,7 @@ import weakref
 import pytest
 
 from vehicle_detection.cli.signals import raise_on_signals
-from vehicle_detection.drive import worker
+from vehicle_detection.drive import worker_pool
 
 
 @pytest.fixture(autouse=True)
@@ -21,7 +21,7 @@ def interruptible():
 
 @contextlib.contextmanager
 def worker_signals():
-    before = signal.signal(signal.SIGINT, worker._interrupt)
+    before = signal.signal(signal.SIGINT, worker_pool._interrupt)
     try:
         yield
     finally:

@@ -23,7 +23,7 @@ def run(sources, out, model, **options):
 def unfinished(out, source):
     """Lock a trip, as another run does that works on it: a batch with this trip outlasts the block."""
     pytest.importorskip("fcntl")
-    with open_store(out).lock(source_id(str(source))) as locked:
+    with open_store(out, create=True).lock(source_id(str(source))) as locked:
         assert locked
         yield
 

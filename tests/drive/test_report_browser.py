@@ -65,8 +65,11 @@ class ScriptedDetector:
         tracks = (first, second) if 20 <= self.index < 40 else (first,)
         return SimpleNamespace(index=self.index, time=time, tracks=tracks, seconds={"search": 0.01})
 
-    def annotate(self, frame, result):
-        return draw_tracks(frame, result.tracks)
+    annotator = SimpleNamespace(
+        draw=lambda frame, result: draw_tracks(frame, result.tracks),
+        output_shape=lambda shape: shape,
+        reset=lambda **_: None,
+    )
 
 
 @pytest.fixture(scope="module")

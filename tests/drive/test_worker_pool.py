@@ -5,9 +5,9 @@ import gc
 import logging
 import os
 import signal
-import subprocess
 import sys
 import time
+from multiprocessing import resource_tracker
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -44,6 +44,15 @@ def warn(*texts):
         logging.getLogger("vehicle_detection.video").warning("%s is damaged", text)
 
 
+def wait_and_note(path):
+    Path(path).write_text("started")
+    try:
+        time.sleep(300)
+    except KeyboardInterrupt:
+        Path(path).write_text("interrupted")
+        raise
+
+
 def process_id(*_):
     time.sleep(0.3)
     return os.getpid()
@@ -63,10 +72,11 @@ def open_files():
 
 @pytest.mark.parametrize(
     ("initializer", "error", "message"),
-    [(kill_this_process, WorkerLost, "signal 9"), (fail, RuntimeError, "ValueError: no model")],
+    [(kill_this_process, WorkerLost, "worker process ended"), (fail, RuntimeError, "ValueError: no model")],
 )
 def test_a_worker_that_dies_at_its_start_leaves_nothing(initializer, error, message):
     gc.collect()  # files that earlier tests have left open
+    resource_tracker.ensure_running()
     before = open_files(), child_processes()
     pool = WorkerPool(1, (initializer, ()))
     calls = [pool.submit(process_id) for _ in range(3)]
@@ -88,32 +98,15 @@ def test_the_first_worker_compiles_the_kernels_before_the_others_start(tmp_path)
     assert all(float(begin) >= first_end for begin, _ in times[1:])
 
 
-SLOW_TO_BE_IDLE = """
-import threading, time
-set_event = threading.Event.set
-def set_late(event):
-    time.sleep(0.5)
-    set_event(event)
-threading.Event.set = set_late
-from vehicle_detection.drive.worker import main
-main()
-"""
-
-
-def test_a_call_right_after_an_answer_ends_with_the_parent_process():
-    command = [sys.executable, "-c", SLOW_TO_BE_IDLE]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as worker:
-        worker.stdin.write('{"call": "builtins:abs", "args": [-1]}\n')
-        worker.stdin.flush()
-        assert worker.stdout.readline() == '{"result": 1, "warnings": []}\n'
-        worker.stdin.write('{"call": "time:sleep", "args": [600]}\n')
-        worker.stdin.flush()
-        time.sleep(1.0)  # until the call has begun
-        worker.stdin.close()
-        try:
-            assert worker.wait(60) == 1
-        finally:
-            worker.kill()
+def test_the_call_of_a_worker_is_interrupted_when_its_batch_ends(tmp_path):
+    pool = WorkerPool(1, (process_id, ()))
+    call = pool.submit(wait_and_note, str(tmp_path / "note"))
+    while not (tmp_path / "note").exists():
+        time.sleep(0.05)
+    pool.shutdown(cancel_futures=True)
+    with pytest.raises(WorkerLost):
+        call.result(60)
+    assert (tmp_path / "note").read_text() == "interrupted"
 
 
 def test_warnings_of_a_worker_are_logged_by_its_parent(caplog, capfd):

@@ -127,11 +127,11 @@ def _uninterrupted() -> Iterator[None]:
             handlers[number](number, frame)
 
     try:
-        for number in signal.valid_signals():
-            handler = signal.getsignal(number)
+        for each in signal.valid_signals():
+            handler = signal.getsignal(each)
             if callable(handler):  # neither ignored nor the default of the system
-                handlers[number] = handler
-                signal.signal(number, delay)
+                handlers[each] = handler
+                signal.signal(each, delay)
         yield
     finally:
         delayed = False

@@ -166,7 +166,8 @@ def run_batch(
         of them may both process a trip.
     executor
         A ``concurrent.futures`` executor, such as that of `open_dask`, whose workers see the same files.
-        None: worker processes of this machine.
+        None: worker processes of this machine, which import the running script, so that a script calls this
+        function below ``if __name__ == "__main__":``.
     model
         A model's name or file.
     options

@@ -1,38 +1,32 @@
-"""An executor of worker processes, one call at a time each, that survives the death of a worker.
+"""The worker processes of a batch, which call one function at a time each.
 
-With ``ProcessPoolExecutor``, one killed process breaks the pool.
+Each process is a pool of its own, opened again after the process has died: in a pool of several processes,
+one that is killed would end the calls of all others.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
+import multiprocessing
 import os
-import queue
+import signal
 import stat
-import subprocess
-import sys
 import tempfile
 import threading
-from collections.abc import Callable
-from concurrent.futures import Executor, Future
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import Connection
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
-from vehicle_detection._common import JOBS_VARIABLE
+from vehicle_detection._common import JOBS_VARIABLE, postpone
 
 _LOGGER = logging.getLogger(__name__)
-
-# The program of a worker. Its argument is the folder that holds this package, which may not be installed.
-# With -P, Python does not search the current folder, where a file may have the name of a module.
-_PROGRAM = """\
-import sys
-if sys.argv[1] not in sys.path:
-    sys.path.insert(0, sys.argv[1])
-from vehicle_detection.drive.worker import main
-main()
-"""
+# Seconds that the current call has to clean up after the parent process has ended.
+_GRACE = 15.0
 
 
 class WorkerLost(Exception):  # noqa: N818 - named after what happened, as BrokenExecutor is
@@ -70,138 +64,160 @@ def _private_folder(name: str) -> str | None:
     return str(folder)
 
 
-class WorkerPool(Executor):
-    """Executor of `workers` processes. Functions are module-level ones, arguments and results JSON values.
+class WorkerPool(ThreadPoolExecutor):
+    """Executor of `workers` processes, each served by a thread. Functions are module-level ones.
 
     `initializer` is called first in each process; the first process completes it before the others start,
     so that they find compiled kernels.
     """
 
     def __init__(self, workers: int, initializer: tuple[Callable[..., Any], tuple[Any, ...]]) -> None:
-        self._calls: queue.SimpleQueue[tuple[Future[Any], str] | None] = queue.SimpleQueue()
-        self._initializer = _message(*initializer)
-        self._first_start = threading.Lock()
-        self._lock = threading.Lock()
+        super().__init__(workers, thread_name_prefix="vehicle-worker")
+        self._first_call = initializer
+        self._start_lock = threading.Lock()
+        self._of_thread = threading.local()
+        # The processes, and the connections whose end interrupts their calls.
+        self._opened: dict[ProcessPoolExecutor, Connection] = {}
         self._stopped = False
-        self._processes: set[subprocess.Popen[str]] = set()
-        self._threads = [
-            threading.Thread(target=self._serve, name="vehicle-worker", daemon=True) for _ in range(workers)
-        ]
-        for thread in self._threads:
-            thread.start()
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Call a function in a worker process; `WorkerLost` if that ends before its result."""
-        assert not kwargs, "keyword arguments are not sent"
-        future: Future[Any] = Future()
-        self._calls.put((future, _message(fn, args)))
-        return future
+        return super().submit(self._call, fn, args, kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the workers; with `cancel_futures` at once, interrupting their calls."""
         if cancel_futures:
-            with self._lock:
-                self._stopped = True
-                for process in self._processes:
-                    with contextlib.suppress(OSError):
-                        assert process.stdin is not None
-                        process.stdin.close()
-            with contextlib.suppress(queue.Empty):
-                while item := self._calls.get_nowait():
-                    item[0].cancel()
-        for _ in self._threads:
-            self._calls.put(None)
-        if wait:
-            for thread in self._threads:
-                thread.join()
+            self._stopped = True
+            for connection in list(self._opened.values()):
+                connection.close()
+        super().shutdown(wait, cancel_futures=cancel_futures)
+        for process in list(self._opened):
+            self._close(process)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Wait for all calls, or end them at once after an error."""
         self.shutdown(cancel_futures=kind is not None)
 
-    def _serve(self) -> None:
-        """Pass calls to one process, which is started again after its death."""
-        process: subprocess.Popen[str] | None = None
-        try:
-            while (item := self._calls.get()) is not None:
-                future, message = item
-                if not future.set_running_or_notify_cancel():
-                    continue
-                try:
-                    if process is None:
-                        process = self._start()
-                    answer = _ask(process, message)
-                except BaseException as error:
-                    self._end(process)
-                    process = None
-                    future.set_exception(error)
-                    continue
-                if "error" in answer:
-                    future.set_exception(RuntimeError(answer["error"]))
-                else:
-                    future.set_result(answer["result"])
-        finally:
-            self._end(process)
+    def _call(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Pass a call to the process of this thread."""
+        process = getattr(self._of_thread, "process", None)
+        if process not in self._opened:
+            process = self._of_thread.process = self._start()
+        return self._ask(process, function, args, kwargs)
 
-    def _start(self) -> subprocess.Popen[str]:
-        # Ctrl-C reaches this process only, which ends the workers.
-        group: dict[str, Any] = {"process_group": 0}
-        if sys.platform == "win32":
-            group = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
-        with self._first_start:
-            with self._lock:
-                if self._stopped:
-                    raise WorkerLost("the batch has been stopped")
-                process = subprocess.Popen(
-                    [sys.executable, "-P", "-c", _PROGRAM, str(Path(__file__).resolve().parents[2])],
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    text=True,
-                    encoding="utf-8",
-                    env={**os.environ, **worker_environment()},
-                    **group,
-                )
-                self._processes.add(process)
+    def _start(self) -> ProcessPoolExecutor:
+        with self._start_lock:
+            if self._stopped:
+                raise WorkerLost("the batch has been stopped")
+            end, connection = multiprocessing.Pipe(duplex=False)
+            process = ProcessPoolExecutor(
+                1, multiprocessing.get_context("spawn"), initializer=_prepare, initargs=(end,)
+            )
+            self._opened[process] = connection
             try:
-                answer = _ask(process, self._initializer)
-                if "error" in answer:
-                    raise RuntimeError(answer["error"])
+                # With PYTHONSAFEPATH, Python does not search the current folder, where a file may have the
+                # name of a module.
+                with _environment(worker_environment() | {"PYTHONSAFEPATH": "1"}):
+                    started = process.submit(os.getpid)
+                started.add_done_callback(lambda _: end.close())
+                self._ask(process, *self._first_call, {})
             except BaseException:
-                self._end(process)
+                self._close(process)
                 raise
         return process
 
-    def _end(self, process: subprocess.Popen[str] | None) -> None:
-        if process is None:
-            return
-        with contextlib.suppress(OSError):
-            assert process.stdin is not None
-            process.stdin.close()
-        process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
-        with self._lock:
-            self._processes.discard(process)
+    def _ask(
+        self,
+        process: ProcessPoolExecutor,
+        function: Callable[..., Any],
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+    ) -> Any:
+        """Call a function in a process; its warnings are logged by this one."""
+        try:
+            result, error, warnings = process.submit(_call, function, args, kwargs).result()
+        except (BrokenProcessPool, RuntimeError, OSError, EOFError, KeyboardInterrupt) as lost:
+            self._close(process)
+            raise WorkerLost("the worker process ended before its result") from lost
+        for text in warnings:
+            _LOGGER.warning("%s", text)
+        if error is not None:
+            raise RuntimeError(error)
+        return result
+
+    def _close(self, process: ProcessPoolExecutor) -> None:
+        connection = self._opened.pop(process, None)
+        process.shutdown()
+        if connection is not None:
+            connection.close()
 
 
-def _message(function: Callable[..., Any], args: tuple[Any, ...]) -> str:
-    return json.dumps({"call": f"{function.__module__}:{function.__name__}", "args": args}) + "\n"
+@contextlib.contextmanager
+def _environment(changes: dict[str, str]) -> Iterator[None]:
+    """Set environment variables for the processes that are started in the block."""
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
-def _ask(process: subprocess.Popen[str], message: str) -> dict[str, Any]:
-    """Send a call and wait for its answer; log the warnings of the worker as those of this process."""
-    assert process.stdin is not None
-    assert process.stdout is not None
-    line = ""
-    with contextlib.suppress(OSError, ValueError):
-        process.stdin.write(message)
-        process.stdin.flush()
-        line = process.stdout.readline()
-    if not line.endswith("\n"):
-        code = process.wait()
-        reason = f"signal {-code}" if code < 0 else f"exit code {code}"
-        raise WorkerLost(f"the worker process ended ({reason})")
-    answer: dict[str, Any] = json.loads(line)
-    for text in answer["warnings"]:
-        _LOGGER.warning("%s", text)
-    return answer
+# What follows runs in the worker process.
+_busy = threading.Event()
+
+
+def _prepare(parent: Connection) -> None:
+    """Prepare a worker: Ctrl-C reaches its parent only, whose end ends it."""
+    if hasattr(os, "setpgid"):
+        os.setpgid(0, 0)
+    signal.signal(signal.SIGINT, _interrupt)
+    threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    if not postpone(number, frame):
+        raise KeyboardInterrupt
+
+
+def _watch(parent: Connection) -> None:
+    """Wait for the end of the parent process; then interrupt the current call, and end the worker."""
+    with contextlib.suppress(EOFError, OSError):
+        parent.recv()
+    if not _busy.is_set():
+        os._exit(1)
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(int(threading.main_thread().ident or 0), signal.SIGINT)
+    else:
+        signal.raise_signal(signal.SIGINT)
+    threading.Event().wait(_GRACE)
+    os._exit(1)
+
+
+class _Collector(logging.Handler):
+    """Keeps the texts of warnings, which the parent process logs."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.texts.append(record.getMessage())
+
+
+def _call(function: Callable[..., Any], args: Any, kwargs: Any) -> tuple[Any, str | None, list[str]]:
+    """Call a function; return its result, its error and its warnings as plain values."""
+    logger, collector = logging.getLogger("vehicle_detection"), _Collector()
+    logger.addHandler(collector)
+    _busy.set()
+    try:
+        return function(*args, **kwargs), None, collector.texts
+    except Exception as error:
+        return None, f"{type(error).__name__}: {error}", collector.texts
+    finally:
+        _busy.clear()
+        logger.removeHandler(collector)
