@@ -233,4 +233,4 @@ def open_coco_results(part: Path, truth: Truth | None) -> Iterator[Write]:
     """Write the list of results that ``COCO.loadRes`` of pycocotools takes."""
     results: list[Record] = []
     yield lambda _, records: results.extend(_result(record, truth) for record in records)
-    part.write_text(json.dumps(results, ensure_ascii=False), encoding="utf-8")
+    part.write_text(json.dumps(results, ensure_ascii=False), encoding="utf-8", newline="\n")
