@@ -46,5 +46,5 @@ def test_a_card_of_twelve_segments_is_one_trip_with_one_identity_per_vehicle(tmp
     scores = evaluate_tracks(tracks, truth, frames=range(len(order)))
     # The same identities before and after each of the eleven cuts.
     assert (scores.id_switches, scores.fragmentations) == (0, 0)
-    assert len(set(tracks.tracks.tolist())) == scores.tracks == found["front"]["tracks"] == 3
+    assert len(set(tracks["track_id"].tolist())) == scores.tracks == found["front"]["tracks"] == 3
     assert scores.f1 > 0.99
