@@ -6,7 +6,6 @@ import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, overload
 
 import numpy as np
@@ -27,8 +26,8 @@ from vehicle_detection._common import (
     shorten,
 )
 from vehicle_detection.boxes import Detections
-from vehicle_detection.datasets import is_image
 from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection.tracking import is_result, shown_tracks
 
 if TYPE_CHECKING:
     import pandas
@@ -440,29 +439,6 @@ class TrackTable:
         return pandas.DataFrame({name: self[name] for name in self.columns})
 
 
-def is_result(item: Any) -> bool:
-    """Whether `item` is a frame's result (a tuple has an ``index`` method, too)."""
-    return hasattr(item, "tracks") and hasattr(item, "index") and not isinstance(item, (Mapping, Sequence))
-
-
-def shown_tracks(tracks: Iterable[Any]) -> list[Any]:
-    """Tracks that are drawn and written, which have different ids."""
-    shown = []
-    for track in [tracks] if isinstance(tracks, str) or not isinstance(tracks, Iterable) else tracks:
-        if not hasattr(track, "id") or not hasattr(track, "box"):
-            raise InvalidInputError(
-                f"tracks must be Track objects, got {describe(track)}; pass result.tracks"
-            )
-        if getattr(track, "shown", True):
-            shown.append(track)
-    repeated = next((track for track, times in Counter(each.id for each in shown).items() if times > 1), None)
-    if repeated is not None:
-        raise InvalidInputError(
-            f"tracks must have unique ids, got {repeated} twice in one frame; pass result.tracks"
-        )
-    return shown
-
-
 def check_keys(values: object, name: str) -> tuple[FrameKey, ...]:
     """Return frame keys as Python values that are all int or all str."""
     given = check_sequence(values, name, "frame keys (int or str)")
@@ -501,39 +477,6 @@ def _check_column(values: ArrayLike | None, name: str, rows: int) -> NDArray[Any
     if outside.any():
         raise InvalidInputError(f"{name} must be {column.expected}; got {given[outside][0]}")
     return given.astype(filled.dtype)
-
-
-def without_suffix(name: str) -> str:
-    """Return the name of a frame without the suffix of an image."""
-    path = PurePosixPath(name)
-    return name[: -len(path.suffix)] if is_image(path.name) else name
-
-
-def match_names(table: TrackTable, keys: Sequence[FrameKey], sides: tuple[str, str]) -> TrackTable:
-    """Rename frames to `keys` where the names differ by a folder or the suffix of an image only.
-
-    Nothing is renamed if a frame is among `keys`. Names that are not unique then are an error, which names
-    `table` and `keys` by `sides`.
-    """
-    if set(table.frame_keys) & set(keys):
-        return table
-    ours, theirs = (
-        {PurePosixPath(without_suffix(key)).name: key for key in side if isinstance(key, str)}
-        for side in (table.frame_keys, keys)
-    )
-    shared = ours.keys() & theirs.keys()
-    if not shared:
-        return table
-    paths = [[f"/{without_suffix(side[name])}" for side in (ours, theirs)] for name in sorted(shared)]
-    different = [pair for pair in paths if not (pair[0].endswith(pair[1]) or pair[1].endswith(pair[0]))]
-    if different or len(ours) < len(table.frame_keys) or len(theirs) < len(keys):
-        name = min(shared)
-        raise InvalidInputError(
-            f"frame names of {sides[0]} and {sides[1]} differ: {ours[name]!r} and {theirs[name]!r}; use the "
-            "same names on both sides, for example with TrackTable.renamed"
-        )
-    names = {ours[name]: theirs[name] for name in shared}
-    return table.renamed(lambda key: names.get(key, key))
 
 
 def parse_cells(

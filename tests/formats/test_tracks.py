@@ -239,7 +239,7 @@ def test_a_stream_appears_whole_or_not_at_all(tmp_path, error, name):
 
 
 def test_memory_does_not_grow_with_the_number_of_parquet_rows(tmp_path, monkeypatch):
-    monkeypatch.setattr("vehicle_detection.formats.write._ROWS_PER_GROUP", 2)
+    monkeypatch.setattr("vehicle_detection._common.parquet._ROWS_PER_GROUP", 2)
     write_tracks(results_of([(frame, 1, 0, 0, 5, 5, 1.0) for frame in range(5)]), tmp_path / "t.parquet")
     parquet = pytest.importorskip("pyarrow.parquet")
     file = parquet.ParquetFile(tmp_path / "t.parquet")

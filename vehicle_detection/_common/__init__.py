@@ -36,7 +36,7 @@ from vehicle_detection._common.files import (
 )
 from vehicle_detection._common.limits import Limit, check_regular_file, read_regular_file
 from vehicle_detection._common.model_file import FORMAT_VERSION, read_model, write_model
-from vehicle_detection._common.parquet import ParquetRows, import_pyarrow, write_parquet
+from vehicle_detection._common.parquet import import_pyarrow, open_parquet
 from vehicle_detection._common.progress import in_notebook, progress_bar
 from vehicle_detection._common.signals import postpone
 from vehicle_detection._common.text import encodable, natural_key, pluralize
@@ -65,7 +65,6 @@ __all__ = [
     "Closing",
     "Floats",
     "Limit",
-    "ParquetRows",
     "ThreadTeam",
     "Units",
     "Workspace",
@@ -108,6 +107,7 @@ __all__ = [
     "mirror_patches",
     "natural_key",
     "number",
+    "open_parquet",
     "pluralize",
     "postpone",
     "progress_bar",
@@ -122,6 +122,5 @@ __all__ = [
     "temporary_folder",
     "with_spare",
     "write_model",
-    "write_parquet",
     "write_text",
 ]

@@ -1,13 +1,12 @@
-"""Parquet files, written at once or in groups of rows."""
+"""Parquet files, written in groups of rows."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-from vehicle_detection._common.files import atomic_write
 from vehicle_detection.errors import InvalidInputError
 
 # Rows per group, which bounds the memory.
@@ -24,48 +23,27 @@ def import_pyarrow() -> Any:
     return pyarrow
 
 
-def write_parquet(
-    path: str | os.PathLike[str], table: Any, *, types: Mapping[str, str] | None = None
-) -> None:
-    """Write a pandas table, or a mapping of column names to lists of values, as a Parquet file.
+@contextlib.contextmanager
+def open_parquet(
+    path: Path, types: Mapping[str, str]
+) -> Iterator[Callable[[Iterable[Mapping[str, Any]]], None]]:
+    """Yield a function that adds rows, by the names of their columns, to a file, in constant memory.
 
-    `types` names the Arrow type of each column, such as ``"int64"``; None infers them from the values.
+    `types` maps the names of the columns to Arrow types, such as ``"int64"``.
     """
     pyarrow = import_pyarrow()
-    schema = None if types is None else pyarrow.schema(list(types.items()))
-    with atomic_write(path, "path") as part:
-        pyarrow.parquet.write_table(pyarrow.table(table, schema=schema), part)
+    schema = pyarrow.schema(list(types.items()))
+    waiting: list[Mapping[str, Any]] = []
 
+    def flush() -> None:
+        writer.write_table(pyarrow.Table.from_pylist(waiting, schema=schema))
+        waiting.clear()
 
-class ParquetRows:
-    """Writer of a Parquet file, row by row in constant memory; `types` maps column names to Arrow types."""
+    def write(rows: Iterable[Mapping[str, Any]]) -> None:
+        waiting.extend(rows)
+        if len(waiting) >= _ROWS_PER_GROUP:
+            flush()
 
-    def __init__(self, path: Path, types: Mapping[str, str]) -> None:
-        self._path = path
-        self._waiting: dict[str, list[Any]] = {name: [] for name in types}
-        self._pyarrow = import_pyarrow()
-        self._schema = self._pyarrow.schema(list(types.items()))
-
-    def __enter__(self) -> Self:
-        self._writer = self._pyarrow.parquet.ParquetWriter(self._path, self._schema)
-        return self
-
-    def write(self, values: Sequence[Any]) -> None:
-        """Add a row, with None where a value is unknown."""
-        columns = list(self._waiting.values())
-        for column, value in zip(columns, values, strict=True):
-            column.append(value)
-        if len(columns[0]) >= _ROWS_PER_GROUP:
-            self._flush()
-
-    def _flush(self) -> None:
-        self._writer.write_table(self._pyarrow.table(self._waiting, schema=self._schema))
-        for column in self._waiting.values():
-            column.clear()
-
-    def __exit__(self, *error: Any) -> None:
-        try:
-            if error[0] is None:
-                self._flush()
-        finally:
-            self._writer.close()
+    with pyarrow.parquet.ParquetWriter(path, schema) as writer:
+        yield write
+        flush()

@@ -45,9 +45,9 @@ def evaluate(
     from json import dumps
 
     from vehicle_detection._common import check_target, write_text
-    from vehicle_detection.evaluation import evaluate_detections, evaluate_tracks
+    from vehicle_detection.evaluation import evaluate_detections, evaluate_tracks, match_names
     from vehicle_detection.formats import read_labels
-    from vehicle_detection.tables import NO_TRACK, match_names
+    from vehicle_detection.tables import NO_TRACK
 
     if json is not None:
         check_target(json, "--json")

@@ -7,15 +7,22 @@ import platform
 import tempfile
 import threading
 import time
-from collections.abc import Collection, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from vehicle_detection import __version__
-from vehicle_detection._common import ParquetRows, check_integer, hide_credentials, is_url, temporary_folder
+from vehicle_detection._common import (
+    check_integer,
+    hide_credentials,
+    import_pyarrow,
+    is_url,
+    open_parquet,
+    temporary_folder,
+)
 from vehicle_detection.annotator import Annotator
 from vehicle_detection.camera import open_camera
 from vehicle_detection.detector import VehicleDetector, load_model
@@ -170,7 +177,7 @@ def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
     with _scratch(store, key) as folder:
         video = None if settings["tracks_only"] else folder / "video.mp4"
         try:
-            with _open(task, folder) as source, _TrackTable(folder / "tracks.parquet", key) as write:
+            with _open(task, folder) as source, _open_tracks(folder / "tracks.parquet", key) as write:
                 report = process_video(
                     source,
                     video,
@@ -255,23 +262,29 @@ def _check_access(file: str) -> None:
         ) from error
 
 
-class _TrackTable(ParquetRows):
-    """Writer of the shown tracks of a trip as a Parquet file."""
+class _TripRows:
+    """Writer of the shown tracks of a trip."""
 
-    def __init__(self, path: Path, key: str) -> None:
-        try:
-            super().__init__(path, _COLUMNS)
-        except InvalidInputError as error:  # not the fault of the source
-            raise OSError(f"this worker cannot write tracks: {error}") from None
-        self._key = key
+    def __init__(self, write: Callable[[list[dict[str, Any]]], None], key: str) -> None:
+        self._write, self._key = write, key
         self.rows = 0
 
     def __call__(self, result: Any) -> None:
         """Add the shown tracks of a frame's result."""
-        for record in track_records(result):
-            time = round(result.time, 4)
-            self.write([{"trip": self._key, "time_s": time, **record}[name] for name in _COLUMNS])
-            self.rows += 1
+        time, records = round(result.time, 4), track_records(result)
+        self._write([{"trip": self._key, "time_s": time, **record} for record in records])
+        self.rows += len(records)
+
+
+@contextmanager
+def _open_tracks(path: Path, key: str) -> Iterator[_TripRows]:
+    """Open the Parquet file of a trip's tracks."""
+    try:
+        import_pyarrow()
+    except InvalidInputError as error:  # not the fault of the source
+        raise OSError(f"this worker cannot write tracks: {error}") from None
+    with open_parquet(path, _COLUMNS) as write:
+        yield _TripRows(write, key)
 
 
 def _scratch(store: Store, key: str) -> AbstractContextManager[Path]:

@@ -10,7 +10,12 @@ from vehicle_detection.evaluation.detections import (
 )
 from vehicle_detection.evaluation.explanation import Explanation, explain
 from vehicle_detection.evaluation.labelled_frames import Frames, LabelledFrames, keyed_frames
-from vehicle_detection.evaluation.matching import DetectionMatches, match_detections, prepare_evaluation
+from vehicle_detection.evaluation.matching import (
+    DetectionMatches,
+    match_detections,
+    match_names,
+    prepare_evaluation,
+)
 from vehicle_detection.evaluation.tracks import TrackScores, evaluate_tracks
 
 __all__ = [
@@ -29,6 +34,7 @@ __all__ = [
     "explain",
     "keyed_frames",
     "match_detections",
+    "match_names",
     "precision_recall_curve",
     "prepare_evaluation",
 ]

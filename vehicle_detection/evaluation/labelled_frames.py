@@ -20,7 +20,8 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.tables import FrameKey, TrackTable, match_names
+from vehicle_detection.evaluation.matching import match_names
+from vehicle_detection.tables import FrameKey, TrackTable
 
 Frames = Mapping[FrameKey, NDArray[np.uint8]] | FrameSet | Sequence[NDArray[np.uint8]]
 """Images by key, a `FrameSet`, or a list of images that are numbered from 0."""

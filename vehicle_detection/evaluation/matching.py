@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,35 @@ from numpy.typing import NDArray
 from vehicle_detection._common import describe
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.tables import NO_TRACK, FrameKey, TrackTable, check_keys, frame_order, match_names
+from vehicle_detection.formats import without_suffix
+from vehicle_detection.tables import NO_TRACK, FrameKey, TrackTable, check_keys, frame_order
+
+
+def match_names(table: TrackTable, keys: Sequence[FrameKey], sides: tuple[str, str]) -> TrackTable:
+    """Rename frames to `keys` where the names differ by a folder or the suffix of an image only.
+
+    Nothing is renamed if a frame is among `keys`. Names that are not unique then are an error, which names
+    `table` and `keys` by `sides`.
+    """
+    if set(table.frame_keys) & set(keys):
+        return table
+    ours, theirs = (
+        {PurePosixPath(without_suffix(key)).name: key for key in side if isinstance(key, str)}
+        for side in (table.frame_keys, keys)
+    )
+    shared = ours.keys() & theirs.keys()
+    if not shared:
+        return table
+    paths = [[f"/{without_suffix(side[name])}" for side in (ours, theirs)] for name in sorted(shared)]
+    different = [pair for pair in paths if not (pair[0].endswith(pair[1]) or pair[1].endswith(pair[0]))]
+    if different or len(ours) < len(table.frame_keys) or len(theirs) < len(keys):
+        name = min(shared)
+        raise InvalidInputError(
+            f"frame names of {sides[0]} and {sides[1]} differ: {ours[name]!r} and {theirs[name]!r}; use the "
+            "same names on both sides, for example with TrackTable.renamed"
+        )
+    names = {ours[name]: theirs[name] for name in shared}
+    return table.renamed(lambda key: names.get(key, key))
 
 
 def prepare_evaluation(

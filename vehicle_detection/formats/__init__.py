@@ -5,11 +5,9 @@ Every table has the columns ``frame,track_id,x1,y1,x2,y2,score``. Tables of trac
 detections in images with ``confidence``.
 """
 
-from vehicle_detection.formats.read import FORMATS, read_labels
+from vehicle_detection.formats.read import FORMATS, read_labels, without_suffix
 from vehicle_detection.formats.write import (
     DIGITS,
-    import_pyarrow,
-    open_parquet,
     open_tracks,
     track_records,
     write_labels,
@@ -19,11 +17,10 @@ from vehicle_detection.formats.write import (
 __all__ = [
     "DIGITS",
     "FORMATS",
-    "import_pyarrow",
-    "open_parquet",
     "open_tracks",
     "read_labels",
     "track_records",
+    "without_suffix",
     "write_labels",
     "write_tracks",
 ]

@@ -13,7 +13,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,7 +30,7 @@ from vehicle_detection._common import (
     shorten,
 )
 from vehicle_detection.boxes import clip_boxes, logit
-from vehicle_detection.datasets import FrameSet, load_frames
+from vehicle_detection.datasets import FrameSet, is_image, load_frames
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.formats.coco import Record, json_reason, read_coco, read_text
 from vehicle_detection.images import image_size, read_image
@@ -46,7 +46,6 @@ from vehicle_detection.tables import (
     frame_order,
     parse_cells,
     parse_number,
-    without_suffix,
 )
 
 FORMATS = {
@@ -328,6 +327,12 @@ def _yolo_frames(files: Sequence[Path], shape: Any) -> list[tuple[FrameKey, tupl
     shape = check_shape(shape)
     numbered = all(file.stem.isdecimal() and file.stem == f"{int(file.stem):06d}" for file in files)
     return [(int(file.stem) if numbered else file.stem, shape) for file in files]
+
+
+def without_suffix(name: str) -> str:
+    """Return the name of a frame without the suffix of an image."""
+    path = PurePosixPath(name)
+    return name[: -len(path.suffix)] if is_image(path.name) else name
 
 
 def _yolo_images(files: Sequence[Path], images: FrameSet) -> list[tuple[FrameKey, tuple[int, ...]]]:

@@ -24,6 +24,7 @@ from vehicle_detection._common import (
     check_type,
     describe,
     is_listing,
+    open_parquet,
     temporary_folder,
 )
 from vehicle_detection.boxes import clip_boxes
@@ -37,7 +38,7 @@ from vehicle_detection.formats.coco import (
     read_truth,
     without_noise,
 )
-from vehicle_detection.formats.read import FOLDER_FORMATS, FORMATS, FRAME_NUMBER
+from vehicle_detection.formats.read import FOLDER_FORMATS, FORMATS, FRAME_NUMBER, without_suffix
 from vehicle_detection.tables import (
     BOX_COLUMNS,
     CORNERS,
@@ -45,10 +46,8 @@ from vehicle_detection.tables import (
     TRACK_COLUMNS,
     FrameKey,
     TrackTable,
-    is_result,
-    shown_tracks,
-    without_suffix,
 )
+from vehicle_detection.tracking import is_result, shown_tracks
 
 TIME_COLUMN = "time_s"
 DIGITS = dict(zip((*TRACK_COLUMNS[2:], TIME_COLUMN), (2, 2, 2, 2, 4, 2, 2, 4, 2, 2, 3)))
@@ -58,8 +57,6 @@ STILL_COLUMNS = (*BOX_COLUMNS, "confidence")
 _TRACK_FORMATS = (*dict.fromkeys(FORMATS.values()), "yolo")
 _STILL_FORMATS = ("csv", "jsonl", "parquet", "coco", "yolo")
 
-# Rows of a Parquet file that are written at once, which bounds the memory.
-_ROWS_PER_GROUP = 50_000
 # Pixels by which a box may extend beyond its image, from rounding.
 _ROUNDING = 1.0
 
@@ -146,43 +143,9 @@ def _open_json_lines(part: Path, target: _Target) -> Iterator[Write]:
 @contextlib.contextmanager
 def _open_parquet(part: Path, target: _Target) -> Iterator[Write]:
     types = {"frame": "string" if target.named else "int64", "track_id": "int64", "occluded": "int64"}
-    types |= {"ignore": "bool", "trip": "string"}
+    types["ignore"] = "bool"
     with open_parquet(part, {name: types.get(name, "double") for name in target.columns}) as write:
         yield lambda _, records: write(records)
-
-
-def import_pyarrow() -> Any:
-    """Return the package pyarrow; raise an error with the remedy if it is missing."""
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise InvalidInputError(".parquet files need pyarrow; pip install pyarrow") from None
-    return pyarrow
-
-
-@contextlib.contextmanager
-def open_parquet(path: Path, types: Mapping[str, str]) -> Iterator[Callable[[Iterable[Record]], None]]:
-    """Yield a function that adds rows to a Parquet file, in constant memory.
-
-    `types` maps the names of the columns to Arrow types, such as ``"int64"``.
-    """
-    pyarrow = import_pyarrow()
-    schema = pyarrow.schema(list(types.items()))
-    waiting: list[Record] = []
-
-    def flush() -> None:
-        writer.write_table(pyarrow.Table.from_pylist(waiting, schema=schema))
-        waiting.clear()
-
-    def write(records: Iterable[Record]) -> None:
-        waiting.extend(records)
-        if len(waiting) >= _ROWS_PER_GROUP:
-            flush()
-
-    with pyarrow.parquet.ParquetWriter(path, schema) as writer:
-        yield write
-        flush()
 
 
 def _mot_line(record: Record, *, first_pixel: int = 1, vehicle_class: int = 3, scores: bool = True) -> str:

@@ -8,7 +8,7 @@ from vehicle_detection.tracking.interpolation import (
     search_interval,
 )
 from vehicle_detection.tracking.scene_cuts import SceneCuts
-from vehicle_detection.tracking.track import FrameResult, Track, TrackParams
+from vehicle_detection.tracking.track import FrameResult, Track, TrackParams, is_result, shown_tracks
 from vehicle_detection.tracking.tracker import Tracker
 
 __all__ = [
@@ -21,6 +21,8 @@ __all__ = [
     "backfill_results",
     "estimate_horizon",
     "interpolate_results",
+    "is_result",
     "search_delay",
     "search_interval",
+    "shown_tracks",
 ]

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 import time as clock
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Checked, Floats, choice, integer, number, pluralize
+from vehicle_detection._common import Checked, Floats, choice, describe, integer, number, pluralize
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 
@@ -316,3 +318,26 @@ class TrackState:
             unexplained = self.unexplained_gap > params.max_coast + TIME_TOLERANCE
             return unexplained or self.hidden_gap > params.max_hidden + TIME_TOLERANCE
         return self.time_since_update > params.tentative_coast + TIME_TOLERANCE
+
+
+def is_result(item: Any) -> bool:
+    """Whether `item` is a frame's result (a tuple has an ``index`` method, too)."""
+    return hasattr(item, "tracks") and hasattr(item, "index") and not isinstance(item, (Mapping, Sequence))
+
+
+def shown_tracks(tracks: Iterable[Any]) -> list[Any]:
+    """Tracks that are drawn and written, which have different ids."""
+    shown = []
+    for track in [tracks] if isinstance(tracks, str) or not isinstance(tracks, Iterable) else tracks:
+        if not hasattr(track, "id") or not hasattr(track, "box"):
+            raise InvalidInputError(
+                f"tracks must be Track objects, got {describe(track)}; pass result.tracks"
+            )
+        if getattr(track, "shown", True):
+            shown.append(track)
+    repeated = next((track for track, times in Counter(each.id for each in shown).items() if times > 1), None)
+    if repeated is not None:
+        raise InvalidInputError(
+            f"tracks must have unique ids, got {repeated} twice in one frame; pass result.tracks"
+        )
+    return shown

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check_integer, check_type, describe, pluralize
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.evaluation import LabelledFrames
+from vehicle_detection.evaluation import LabelledFrames, match_names
 from vehicle_detection.formats import read_labels
-from vehicle_detection.tables import FrameKey, TrackTable, match_names
+from vehicle_detection.tables import FrameKey, TrackTable
 from vehicle_detection.video import is_video_file, probe_video, read_frames
 
 _LABEL_SUFFIXES = (".csv", ".json", ".jsonl", ".parquet")

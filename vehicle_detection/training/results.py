@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_path, check_target, describe, write_parquet, write_text
+from vehicle_detection._common import (
+    atomic_write,
+    check_path,
+    check_target,
+    describe,
+    import_pyarrow,
+    write_text,
+)
 from vehicle_detection.errors import DatasetError, InvalidInputError
 
 if TYPE_CHECKING:
@@ -99,7 +106,9 @@ def write_results(table: DataFrame, path: str | os.PathLike[str]) -> None:
         # A Parquet column has one type, but hog_channel is 0 or "ALL": write mixed columns as text.
         mixed = [name for name in table if table[name].dropna().map(type).nunique() > 1]
         table = table.assign(**{name: table[name].map(str, na_action="ignore") for name in mixed})
-        write_parquet(path, table.reset_index(drop=True))
+        pyarrow = import_pyarrow()
+        with atomic_write(path, "path") as part:
+            pyarrow.parquet.write_table(pyarrow.table(table.reset_index(drop=True)), part)
         return
     lines = [_csv_line(table.columns)] if suffix == ".csv" else []
     lines += [_format_row(row, table.columns, suffix) for row in table.to_dict("records")]
