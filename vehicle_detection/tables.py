@@ -49,9 +49,7 @@ LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autoricksha
 _CLASS_COLUMNS = ("class", "label", "category")
 
 _FLAGS = {"false": False, "true": True, "0": False, "1": True, "0.0": False, "1.0": True}
-# Distances and speeds beyond this are unknown.
-_ABSURD = 1e9
-_MAX_ID = 2**62
+_ABSURD, _MAX_ID = 1e9, 2**62  # distances and speeds beyond the first are unknown
 
 
 class _Column(NamedTuple):
@@ -78,8 +76,7 @@ _COLUMNS = {
 }
 """All columns except ``frame`` and the corners of the boxes."""
 
-# What is taken from a `Track` when a frame is appended.
-_APPENDED = (*TRACK_COLUMNS[len(BOX_COLUMNS) - 1 :], "time_since_update")
+_APPENDED = (*TRACK_COLUMNS[6:], "time_since_update")  # of a `Track`
 
 
 class TrackTable:
@@ -155,8 +152,9 @@ class TrackTable:
                 raise InvalidInputError(
                     f"frame {key!r} holds track {track} twice; give each vehicle its own number"
                 )
+        kind = object if frames and isinstance(frames[0], str) else np.int64
         keys = set(check_keys((*check_keys(frame_keys, "frame_keys"), *frames), "frame_keys"))
-        self._set({"frame": _key_array(frames), "boxes": corners, **given}, sorted(keys, key=frame_order))
+        self._set({"frame": np.array(frames, kind), "boxes": corners, **given}, sorted(keys, key=frame_order))
 
     def _set(self, columns: dict[str, NDArray[Any]], keys: Sequence[FrameKey]) -> Self:
         # Columns of an appended table have room for more rows than `_size`.
@@ -176,13 +174,7 @@ class TrackTable:
 
     @classmethod
     def from_detections(cls, detections: Mapping[FrameKey, Detections]) -> TrackTable:
-        """Collect the detections of each frame; frames without any still count as frames.
-
-        Raises
-        ------
-        InvalidInputError
-            If `detections` is not a dictionary of `Detections` by frame.
-        """
+        """Collect the detections of each frame, by its key; frames without any count as frames."""
         check_type(detections, "detections", Mapping, "pass dict(enumerate(detections)) for a list")
         for key, found in detections.items():
             check_type(found, f"detections[{key!r}]", Detections, "pass Detections(boxes, scores)")
@@ -203,8 +195,7 @@ class TrackTable:
     def from_results(cls, results: Iterable[Any]) -> TrackTable:
         """Collect the tracks that a detector shows from the :class:`FrameResult` of each frame.
 
-        They are what `read_labels` reads from the CSV file that `write_tracks` writes, without its rounding.
-        Frames without a track still count as frames.
+        Frames without a track still count as frames. `write_tracks` writes the same, rounded.
         """
         if isinstance(results, Mapping) or not is_listing(results):
             raise InvalidInputError(f"results must be a list of FrameResult, got {describe(results)}")
@@ -212,8 +203,7 @@ class TrackTable:
         for result in results:
             if not is_result(result):
                 raise InvalidInputError(
-                    f"results must be FrameResult objects, got {describe(result)}; "
-                    "read a file with read_labels"
+                    f"results must be FrameResult objects, got {describe(result)}; use read_labels for files"
                 )
             table.append(result)
         return table
@@ -377,10 +367,7 @@ class TrackTable:
         return ((key, self.frame(key)) for key in self.frame_keys)
 
     def by_track(self) -> dict[int, TrackTable]:
-        """Rows of each track, ordered by frame; tracks are in the order of their first frames.
-
-        Boxes without a track are left out.
-        """
+        """Rows of each track in the order of frames, first frames first; boxes without a track are left out."""
         numbers = {key: number for number, key in enumerate(self._keys)}
         frames = np.array([numbers[key] for key in self["frame"].tolist()], np.intp)
         order = np.lexsort((frames, self["track_id"]))
@@ -453,10 +440,6 @@ def check_keys(values: object, name: str) -> tuple[FrameKey, ...]:
 def frame_order(key: FrameKey) -> tuple[list[object], str]:
     """Natural sort key: frame 2 comes before frame 10, also in file names."""
     return ([key], "") if isinstance(key, int) else natural_key(key)
-
-
-def _key_array(keys: Sequence[FrameKey]) -> NDArray[Any]:
-    return np.array(keys, object if keys and isinstance(keys[0], str) else np.int64)
 
 
 def _check_column(values: ArrayLike | None, name: str, rows: int) -> NDArray[Any]:

@@ -349,11 +349,6 @@ def open_tracks(
     TrackStream
         Function that takes the :class:`FrameResult` of each frame; its ``rows`` counts those written so far.
 
-    Raises
-    ------
-    InvalidInputError
-        As in `write_tracks`.
-
     Examples
     --------
     >>> import tempfile
