@@ -367,7 +367,7 @@ class TrackTable:
         return ((key, self.frame(key)) for key in self.frame_keys)
 
     def by_track(self) -> dict[int, TrackTable]:
-        """Rows of each track in the order of frames, first frames first; boxes without a track are left out."""
+        """Rows of each track by frame, in the order of first frames; boxes without a track are left out."""
         numbers = {key: number for number, key in enumerate(self._keys)}
         frames = np.array([numbers[key] for key in self["frame"].tolist()], np.intp)
         order = np.lexsort((frames, self["track_id"]))
