@@ -150,7 +150,7 @@ class Runs:
         listed = {params for plan in PLANS.values() for params in plan.configurations.values()}
         with ExitStack() as stack:
             searches = {
-                params: stack.enter_context(closing(_zero_classifier(params).open_search(n_jobs=1)))
+                params: stack.enter_context(closing(_zero_classifier(params).open_search(jobs=1)))
                 for params in listed
             }
             turns = [

@@ -305,25 +305,14 @@ def test_a_given_heat_threshold_is_kept_and_checked_against_the_density():
         assert heat_range(search, WHOLE).high == np.inf
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"horizon": 2}, "horizon must be a number"),
-        ({"horizon_tolerance": -1}, "horizon_tolerance must be a number"),
-        ({"min_score": None}, "min_score must be a number"),
-    ],
-)
-def test_invalid_function_params_are_rejected(options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        FunctionParams(**options)
+def test_invalid_function_params_are_rejected():
+    with pytest.raises(InvalidInputError, match="min_score must be a number"):
+        FunctionParams(min_score=None)
 
 
-@pytest.mark.parametrize("params", [SearchParams.default(), NetworkParams(), FunctionParams(horizon=0.4)])
-def test_everywhere_searches_all_rows(params):
-    everywhere = params.everywhere()
-    assert type(everywhere) is type(params)
-    if isinstance(params, SearchParams):
-        assert {(band.y1, band.y2) for band in everywhere.place((720, 1280))} == {(0, 720)}
+def test_everywhere_searches_all_rows():
+    everywhere = SearchParams.default().everywhere()
+    assert {(band.y1, band.y2) for band in everywhere.place((720, 1280))} == {(0, 720)}
 
 
 def test_values_of_numpy_become_those_of_python():

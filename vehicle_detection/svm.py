@@ -256,12 +256,12 @@ class VehicleClassifier:
         """The model as filters over the bands of a frame; an error if windows cannot share the features."""
         return BandFilters(self.params, [template.fold() for template in self.templates])
 
-    def open_search(self, n_jobs: int | None = None) -> BandSearch:
+    def open_search(self, jobs: int | None = None) -> BandSearch:
         """Open a search of frames with this model: a thread-safe context manager, with `SearchParams`.
 
-        The result does not depend on the number of threads, `n_jobs`.
+        The result does not depend on the number of threads, `jobs`.
         """
-        return BandSearch(self.filters, n_jobs)
+        return BandSearch(self.filters, jobs)
 
     def __repr__(self) -> str:
         return f"VehicleClassifier({self.summary()[0]})"

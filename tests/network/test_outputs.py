@@ -90,7 +90,7 @@ def load(tmp_path, graph, **options):
 
 
 def find(model, frame=FRAME, params=None, **options):
-    with model.open_search(n_jobs=1) as search:
+    with model.open_search(jobs=1) as search:
         return search.find(frame, params, **options)
 
 

@@ -35,7 +35,7 @@ def model(file):
 
 
 def find(model, image=IMAGE, params=None, *, n_jobs=1, score=0.0):
-    with model.open_search(n_jobs=n_jobs) as search:
+    with model.open_search(jobs=n_jobs) as search:
         return search.find(image, params, min_vehicle_score=score)
 
 
@@ -95,7 +95,7 @@ def test_the_result_depends_on_nothing_but_the_frame(model):
     image = IMAGE.copy()
     check_equal(one, find(model, image[::1]))
     np.testing.assert_array_equal(image, IMAGE)
-    with model.open_search(n_jobs=1) as search:
+    with model.open_search(jobs=1) as search:
         search.find(IMAGE[:100, :50])
         check_equal(one, search.find(IMAGE))
         search.close()
@@ -117,7 +117,7 @@ def test_both_libraries_find_the_same(file, model):
 @pytest.mark.parametrize("runtime", RUNTIMES)
 def test_threads(file, runtime):
     images = [np.roll(IMAGE, 40 * shift, axis=1)[: 300 + 20 * (shift % 4)] for shift in range(8)]
-    with load_network(file, runtime=runtime).open_search(n_jobs=2) as search, ThreadPoolExecutor(4) as pool:
+    with load_network(file, runtime=runtime).open_search(jobs=2) as search, ThreadPoolExecutor(4) as pool:
         expected = [search.find(image) for image in images]
         for one, other in zip(expected * 3, pool.map(search.find, images * 3)):
             check_equal(one, other)
@@ -139,7 +139,7 @@ def search_model(model):
 @pytest.mark.parametrize("runtime", RUNTIMES)
 def test_a_forked_process(file, runtime):
     global SEARCH
-    with load_network(file, runtime=runtime).open_search(n_jobs=2) as SEARCH:
+    with load_network(file, runtime=runtime).open_search(jobs=2) as SEARCH:
         expected = SEARCH.find(IMAGE).vehicles.boxes
         with multiprocessing.get_context("fork").Pool(1) as pool:
             (boxes,) = pool.map_async(search_in_child, [0]).get(timeout=60)
@@ -200,7 +200,7 @@ def test_malformed_frames(model, image, remedy):
 
 def test_malformed_arguments(model, tmp_path):
     with pytest.raises(InvalidInputError, match="n_jobs"):
-        model.open_search(n_jobs=0)
+        model.open_search(jobs=0)
     with pytest.raises(InvalidInputError, match="params must be a NetworkParams"):
         find(model, params=HeatParams())
     with pytest.raises(InvalidInputError, match="slope"):
@@ -276,7 +276,7 @@ def test_input_layouts(tmp_path, dtype, layout, runtime):
     file = tmp_path / "echo.onnx"
     file.write_bytes(echo_network(dtype=dtype, layout=layout))
     model = load_network(file, runtime=runtime)
-    found = model.open_search(n_jobs=1).find(frame)
+    found = model.open_search(jobs=1).find(frame)
     center = np.array([20, 30]) / (1 if dtype == "uint8" else 255)
     sides = np.array([24 / (1 if dtype == "uint8" else 255), 10])
     corners = np.concatenate([center - sides / 2, center + sides / 2]).clip(0, 64)
@@ -319,15 +319,12 @@ def test_other_inputs(tmp_path, inputs):
 
 
 def test_params():
-    assert NetworkParams.default().horizon == 0.5
-    assert NetworkParams().with_horizon(None) == NetworkParams().everywhere() == NetworkParams()
-    assert NetworkParams(input_size=320).with_horizon(0.4).horizon_tolerance == 0.06
+    assert NetworkParams.default() == NetworkParams()
     assert heat_range(NetworkParams(), HeatParams()).default == 0
     for wrong in (
         {"input_size": 100},
         {"input_size": 16},
         {"input_size": 64.0},
-        {"horizon": 2},
         {"min_score": "a"},
     ):
         with pytest.raises(InvalidInputError, match=next(iter(wrong))):

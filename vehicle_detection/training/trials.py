@@ -299,7 +299,7 @@ class TrialEvaluator:
         row["accuracy"] = self.accuracy(classifier, split.test)
         if on_frames and (self.options.frame_sets or self.options.time_search):
             try:
-                classifier.open_search(n_jobs=1).close()
+                classifier.open_search(jobs=1).close()
             except InvalidInputError as error:
                 return {"status": "partial", "message": str(error), **row}
             if self.options.time_search:
@@ -347,7 +347,7 @@ class TrialEvaluator:
         if classifier.params not in self._search_ms:
             frame = np.random.default_rng(0).integers(0, 256, (*_TIMED_SHAPE, 3), np.uint8)
             seconds = []
-            with contextlib.closing(classifier.open_search(n_jobs=1)) as search:
+            with contextlib.closing(classifier.open_search(jobs=1)) as search:
                 # The first run compiles kernels and allocates buffers.
                 for _ in range(_TIMED_RUNS + 1):
                     start = time.perf_counter()

@@ -57,7 +57,7 @@ FOLD_COLUMNS = {
 class SearchableModel(Protocol):
     """A model of any kind: ``"default"``, ``"highway"``, a network or a function."""
 
-    def open_search(self, n_jobs: int | None = None) -> FrameSearch:
+    def open_search(self, jobs: int | None = None) -> FrameSearch:
         """Open a search of frames."""
 
 
@@ -184,7 +184,7 @@ def detect_in_source(
         If an argument is malformed.
     """
     lowest = check_number(min_score, "min_score")
-    with model.open_search(n_jobs=1) as search, ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
+    with model.open_search(jobs=1) as search, ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
 
         def detect(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Any]:
             return pair[0], search.find(pair[1], None, min_vehicle_score=lowest).vehicles
