@@ -101,8 +101,6 @@ class DrawParams(Checked):
     units
         Units of labels and bird's-eye view: ``"metric"`` (m and km/h) or ``"imperial"`` (ft and mph).
 
-    Examples
-    --------
     >>> DrawParams(labels=("id", "distance"), color_by="distance").panel
     'none'
     """
@@ -369,10 +367,7 @@ class Annotator:
     diagnostics
         Show the frame, its positive windows, the heat map and the tracks side by side, as `draw_diagnostics`.
 
-    Examples
-    --------
-    >>> annotator = Annotator(DrawParams(panel="side"))
-    >>> annotator.output_shape((720, 1280))
+    >>> Annotator(DrawParams(panel="side")).output_shape((720, 1280))
     (720, 1496, 3)
     """
 
