@@ -58,16 +58,14 @@ def train(
         presets += [FeatureParams.preset(name) for name in compare or ()]
     if gamma is None:
         gamma = 0.0 if no_mirror else 0.4
-    options = TrainingOptions(C=C, mirror=not no_mirror, gamma=gamma, degraded=degraded, random_state=seed)
+    training = TrainingOptions(C=C, mirror=not no_mirror, gamma=gamma, degraded=degraded, random_state=seed)
+    options: dict[str, Any] = {"options": training, "split": split, "progress": True}
 
     with capture_stderr():
         patches = load_training_patches(vehicles, non_vehicles)
 
     def train_all() -> list[Any]:
-        return [
-            train_and_evaluate(patches, params=params, options=options, split=split, progress=True)
-            for params in presets
-        ]
+        return [train_and_evaluate(patches, params=params, **options) for params in presets]
 
     (classifier, evaluated), *rest = run_interruptible(train_all)
     others = [other for _, other in rest]

@@ -87,7 +87,7 @@ def _check_run(options: VideoOptions, source: FrameSource, detector: VehicleDete
     """Refuse what `process_video` would refuse, before anything is computed or replaced."""
     from vehicle_detection.video import check_video_target, track
 
-    track(source, detector, workers=options.jobs, **options.span()).close()
+    track(source, detector, workers=options.jobs, every=options.every, **options.span()).close()
     if options.output is not None:
         check_video_target(options.output, source.files, preset=options.preset)
 
