@@ -274,7 +274,7 @@ def identity_of(pattern):
         ({"model": object()}, "model must be a name or the path of a file"),
         ({"options": {"camera": object()}}, "options must hold numbers, strings, lists and None"),
         ({"options": {"camera": str(Path(__file__))}}, r"camera file .+test_batch.py is not JSON"),
-        ({"options": {"evry": 2}}, "options must be arguments of VehicleDetector; .* 'evry'"),
+        ({"options": {"evry": 2}}, "options must be classes, device.* 'evry'"),
         ({"options": {"every": 0}}, "every must be an integer"),
         ({"preset": "quick"}, "preset must be one of 'ultrafast'"),
         ({"sources": []}, "sources must name at least one video, got none"),
