@@ -69,6 +69,8 @@ def _run(
     folder: Path, detector: VehicleDetector, *, frames: int, random_state: int, report: bool
 ) -> tuple[VideoReport, TrackScores]:
     """Draw a drive, annotate and score it, oncoming vehicles too; an error leaves no file in the folder."""
+    import numpy as np
+
     from vehicle_detection._common import temporary_folder
     from vehicle_detection.drive import ReportWriter
     from vehicle_detection.evaluation import evaluate_tracks
