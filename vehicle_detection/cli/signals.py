@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -37,13 +38,12 @@ def raise_on_signals() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    from vehicle_detection._common import postpone  # not at the start, where it takes tenths of a second
-
     last = -_CLEANUP_SECONDS
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         nonlocal last
-        if postpone(number, frame):
+        common = sys.modules.get("vehicle_detection._common")  # importing it takes tenths of a second
+        if common is not None and common.postpone(number, frame):
             return
         previous, last = last, time.monotonic()
         if last - previous > _CLEANUP_SECONDS:

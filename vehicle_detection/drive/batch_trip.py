@@ -82,7 +82,8 @@ def open_detector(
     blur: Literal["vehicles", "plates"] | None = None,
 ) -> VehicleDetector:
     """Open the detector of a model and the options of a batch, of which `every` is that of the video."""
-    check_integer(every or 1, "every", low=1, high=1000)
+    if every is not None:
+        check_integer(every, "every", low=1, high=1000)
     return VehicleDetector(
         load_model(model, classes=classes, device=device),
         conf=conf,
