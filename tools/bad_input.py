@@ -126,10 +126,10 @@ def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
 
 
 INTERNAL = {
-    "Event.text", "FeatureParams.spatial_planes", "FrameSource.audio", "FrameSource.read",
-    "HeatParams.for_search", "NetworkModel.feeds",
-    "NetworkModel.input_size_for", "NetworkModel.probability", "NetworkModel.scores",
-    "SearchBand.place", "SearchParams.place",
+    "Event.text", "FeatureParams.spatial_planes", "FrameResult.unsearched", "FrameSource.audio",
+    "FrameSource.read", "HeatParams.for_search", "NetworkModel.feeds", "NetworkModel.input_size_for",
+    "NetworkModel.probability", "NetworkModel.scores", "NetworkModel.with_confidence",
+    "RegionParams.with_peak", "SearchBand.place", "SearchParams.place", "TrackTable.select",
 }  # fmt: skip
 """Methods that only the library calls, with its own results."""
 
@@ -228,7 +228,8 @@ class _Valid:
                   "spatial_size": (16, 16), "hist_bins": 16, "windows": [((0, 0), (64, 64))], "ystart": 0,
                   "ystop": 96, "scale": 1.0}  # fmt: skip
         self.instances: dict[str, Any] = {
-            "Camera": camera, "Detections": windows, "Explorer": vd.Explorer([image], classifier),
+            "Annotator": vd.Annotator(), "Camera": camera, "Detections": windows,
+            "Detector": detector.detector, "Explorer": vd.Explorer([image], classifier),
             "TrackTable": predicted, "FunctionParams": vd.FunctionParams(), "HeatHistory": vd.HeatHistory(),
             "FrameSource": vd.open_source(clip), "HeatmapDetector": vd.HeatmapDetector(classifier),
             "NetworkModel": vd.load_model("default"), "NetworkParams": vd.NetworkParams(),
@@ -236,7 +237,8 @@ class _Valid:
             "Platt": vd.Platt(-1.0, 0.0),
             "ReportWriter": vd.ReportWriter(folder / "writer.html"),
             "SearchParams": search,
-            "Tracker": tracker, "VehicleClassifier": classifier, "VehicleDetector": detector,
+            "RegionParams": vd.RegionParams(), "SceneCuts": vd.SceneCuts(), "Tracker": tracker,
+            "VehicleClassifier": classifier, "VehicleDetector": detector,
         }  # fmt: skip
         self.by_name: dict[str, Any] = {
             "image": image, "img": image, "frame": image, "patches": patches, "labels": labels,
@@ -292,6 +294,7 @@ class _Valid:
             "VehicleClassifier.from_pipeline": {"params": params},
             "VehicleClassifier.save": {"path": folder / "out.safetensors"},
             "NetworkModel.save": {"path": folder / "out.onnx"},
+            "Detector.fit": {"found": detector.search(image)},
             "VehicleDetector.track": {"found": detector.search(image)},
             "batch_status": {"out": folder},
             "bin_spatial": {"size": 16},

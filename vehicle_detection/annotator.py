@@ -17,10 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import (
     UNITS,
     Checked,
+    check_bool,
     check_boxes,
     check_choice,
     check_flags,
     check_image,
+    check_number,
+    check_shape,
     check_type,
     checked_field,
     choice,
@@ -385,9 +388,8 @@ class Annotator:
             if value is not None:
                 check_type(value, name, kind, "omit it for the default")
         if own_speed is not None and not callable(getattr(own_speed, "at", None)):
-            raise InvalidInputError(
-                f"own_speed must have a method at, got {describe(own_speed)}; pass read_own_speed(...)"
-            )
+            got = describe(own_speed)
+            raise InvalidInputError(f"own_speed must have a method at, got {got}; pass read_own_speed(...)")
         if blur is not None:
             check_choice(blur, "blur", BLUR_REGIONS)
         check_flags(diagnostics=diagnostics)
@@ -410,7 +412,7 @@ class Annotator:
 
     def reset(self, *, fps: float | None = None) -> None:
         """Forget all frames, before the first frame of another video; `fps` is for results without times."""
-        self._fps = fps or _USUAL_FPS
+        self._fps = _USUAL_FPS if fps is None else check_number(fps, "fps", above=0)
         self._placer = LabelPlacer()
         self._panel: BirdsEyePanel | None = None
         self._time = -math.inf
@@ -418,7 +420,7 @@ class Annotator:
 
     def output_shape(self, shape: tuple[int, ...]) -> tuple[int, int, int]:
         """Shape of a picture for frames of ``(height, width, ...)``; a view beside it adds columns."""
-        height, width = shape[:2]
+        height, width = check_shape(shape)
         beside = self.style.panel == "side" and not self.diagnostics
         return height, width + (BirdsEyePanel.side_size(shape)[1] if beside else 0), 3
 
@@ -443,6 +445,8 @@ class Annotator:
         If the frame was not searched, the boxes are dashed that were not detected in the last searched one.
         """
         shape, style = check_image(image).shape, self.style
+        time = None if time is None else check_number(time, "time")
+        searched = check_bool(searched, "searched")
         shown = sorted((track for track in _check_tracks(tracks) if track.shown), key=lambda track: track.id)
         own_mps = math.nan if self.own_speed is None or time is None else float(self.own_speed.at(time))
         if time is None or time < self._time:
@@ -468,12 +472,8 @@ class Annotator:
         for track, color in sorted(zip(shown, colors), key=lambda pair: float(pair[0].box[3])):
             draw_outline(frame, round_box(track.box), color, width, dashed=track.id in dashed)
         speed = own_mps if math.isfinite(own_mps) else None
-        requests = [
-            LabelRequest(
-                track.id, tuple(track_fields(track, style.labels, style.units, speed)), round_box(track.box)
-            )
-            for track in shown
-        ]
+        fields = [tuple(track_fields(track, style.labels, style.units, speed)) for track in shown]
+        requests = [LabelRequest(track.id, each, round_box(track.box)) for track, each in zip(shown, fields)]
         draw_labels(frame, self._placer.place(requests, shape, blocked), colors, width)
         return result
 

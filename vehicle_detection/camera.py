@@ -248,7 +248,9 @@ class Camera(Checked):
         """Return the camera with another horizon and standard error, as fractions of the frame's height."""
         height = (self.shape or _REFERENCE_SHAPE)[0]
         row = check_number(horizon, "horizon", low=0, high=1) * height
-        return dataclasses.replace(self, horizon_px=row, horizon_std_px=std * height)
+        return dataclasses.replace(
+            self, horizon_px=row, horizon_std_px=check_number(std, "std", low=0) * height
+        )
 
     def for_shape(self, shape: tuple[int, ...]) -> Camera:
         """Return the camera in pixels of frames of ``(height, width, ...)``, another size of the same video.
@@ -459,7 +461,7 @@ def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int,
     320
     """
     check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
-    height, width = check_shape(shape or camera.shape or _REFERENCE_SHAPE)
+    height, width = check_shape((camera.shape or _REFERENCE_SHAPE) if shape is None else shape)
     values = {"image_size": [width, height], **dataclasses.asdict(camera.for_shape((height, width)))}
     del values["shape"]
     write_text(path, json.dumps(values, indent=2) + "\n", "path")

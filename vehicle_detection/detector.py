@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import (
     Closing,
+    check_bool,
     check_choice,
     check_image,
     check_number,
@@ -261,6 +262,7 @@ class Detector(Closing):
 
     def fit(self, found: SearchResult) -> Detections:
         """Return the vehicles of a search with confidences, including scores below 0."""
+        check_type(found, "found", SearchResult, "pass what search returns")
         if self.heat_params is not None:
             return label_heat(frame_heat(found.shape, found.windows, self.heat_params), self.heat_params)
         vehicles = found.vehicles
@@ -485,7 +487,7 @@ class VehicleDetector(Closing):
         with self._one_thread:
             start, time = clock.perf_counter(), _check_time(time)
             shape = check_image(frame, "frame").shape
-            found = self._search_next(frame) if search else None
+            found = self._search_next(frame) if check_bool(search, "search") else None
             cut = self._cuts.update(frame)
             if found is None and not cut and self.tracker.follows(shape, time):
                 self._skipped += 1
@@ -521,7 +523,7 @@ class VehicleDetector(Closing):
         """
         check_type(found, "found", SearchResult, "pass what search returns")
         with self._one_thread:
-            return self._track(found, _check_time(time), frames, cut)
+            return self._track(found, _check_time(time), frames, check_bool(cut, "cut"))
 
     def _track(self, found: SearchResult, time: float | None, frames: int, cut: bool) -> FrameResult:
         start, heat_params = clock.perf_counter(), self.detector.heat_params

@@ -454,7 +454,7 @@ def _check_estimators(clf: Any, scaler: Any, options: FeatureOptions, image: Ima
     # Only classes of scikit-learn: others may predict in another way, as does a replaced method.
     known = all(each is None or type(each).__module__.startswith("sklearn.") for each in (clf, scaler))
     state: list[Any] | None = None
-    if known and "predict" not in vars(clf):
+    if known and clf is not None and "predict" not in vars(clf):
         state = [type(clf), type(scaler)]
         state += [getattr(each, name, None) for each in (clf, scaler) for name in _MODEL_STATE]
     last = _last

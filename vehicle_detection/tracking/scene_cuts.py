@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._common import check_image
+
 _THUMBNAIL_SHAPE = (18, 32)
 # Mean absolute difference of the thumbnails of consecutive frames, 0-255, above which the scene has been cut.
 _CUT_DIFFERENCE = 40.0
@@ -28,6 +30,7 @@ class SceneCuts:
 
     def update(self, frame: NDArray[np.uint8]) -> bool:
         """Whether the next ``(H, W, 3)`` frame, of any size, belongs to another scene than the one before."""
+        check_image(frame, "frame")
         # The gray values of some pixels are enough, and take no time.
         thumbnail = frame[_thumbnail_pixels(frame.shape[:2])].mean(axis=2, dtype=np.float32)
         last, self._last = self._last, thumbnail

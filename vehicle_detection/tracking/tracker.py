@@ -16,7 +16,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Floats, check_integer, check_number, check_shape, check_type
+from vehicle_detection._common import (
+    Floats,
+    check_bool,
+    check_integer,
+    check_number,
+    check_shape,
+    check_type,
+)
 from vehicle_detection.boxes import LOG_ODDS, Detections, Platt, box_areas, on_one_vehicle
 from vehicle_detection.camera import Camera, FrameShape, truncated_edges
 from vehicle_detection.tracking.association import (
@@ -183,7 +190,7 @@ class Tracker:
             detections = Detections.from_supervision(detections)
         check_type(detections, "detections", Detections, "pass Detections(boxes, scores)")
         frame = check_shape(shape)
-        if cut:
+        if check_bool(cut, "cut"):
             self.end_tracks()
         dt = self._advance(frame, time, check_integer(frames, "frames", low=1))
         if dt == 0:

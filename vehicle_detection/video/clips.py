@@ -62,6 +62,8 @@ def annotate_clip(
     >>> clip = VideoFileClip("drive.mp4").subclipped(2, 12)  # doctest: +SKIP
     >>> annotate_clip(clip, VehicleDetector()).write_videofile("found.mp4")  # doctest: +SKIP
     """
+    if not all(hasattr(detector, name) for name in ("process", "reset", "annotator")):
+        raise InvalidInputError(f"detector must be a VehicleDetector, got {describe(detector)}")
     given: Any = clip
     if not all(hasattr(given, name) for name in ("transform", "get_frame", "size")):
         raise InvalidInputError(
