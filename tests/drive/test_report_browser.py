@@ -3,18 +3,18 @@
 import itertools
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tools.browser import PHONE, Browser
-from vehicle_detection.annotator import draw_tracks
+from vehicle_detection.annotator import Annotator
+from vehicle_detection.boxes import Detections
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drive import ReportWriter
 from vehicle_detection.scenes import render_drive
-from vehicle_detection.tracking import Track
+from vehicle_detection.tracking import FrameResult, Track
 from vehicle_detection.video import process_video
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="process groups and file names of POSIX")
@@ -63,13 +63,10 @@ class ScriptedDetector:
         )
         second = replace(first, id=2, box=box + 150, distance_m=None, speed_mps=-1.0)
         tracks = (first, second) if 20 <= self.index < 40 else (first,)
-        return SimpleNamespace(index=self.index, time=time, tracks=tracks, seconds={"search": 0.01})
+        none = Detections.empty()
+        return FrameResult(self.index, time, none, none, tracks, {"search": 0.01})
 
-    annotator = SimpleNamespace(
-        draw=lambda frame, result: draw_tracks(frame, result.tracks),
-        output_shape=lambda shape: shape,
-        reset=lambda **_: None,
-    )
+    annotator = Annotator()
 
 
 @pytest.fixture(scope="module")
