@@ -42,18 +42,18 @@ ROOT = Path(__file__).parents[1]
 
 _PACKAGE = "vehicle_detection"
 TARGETS = {
-    "features": ("tests/features",),
+    "features.py": ("tests/test_features.py",),
     "search.py": ("tests/test_search.py",),
     "heatmap.py": ("tests/test_heatmap.py",),
     "regions.py": ("tests/test_regions.py",),
     "windows.py": ("tests/test_windows.py",),
-    "boxes": ("tests/test_boxes.py", "tests/evaluation/test_calibration.py"),
+    "boxes.py": ("tests/test_boxes.py", "tests/evaluation/test_calibration.py"),
     "tracking": ("tests/tracking",),
     "network": ("tests/network",),
 }
 """Files and folders of the package that are changed, with the tests of each."""
 
-OTHER_TESTS = ("tests/test_detector.py", "tests/test_confidence.py", "tests/test_stream.py")
+OTHER_TESTS = ("tests/test_detector.py", "tests/video/test_engine.py")
 """Further tests, which run for a change of a line that they execute."""
 
 PRELOADED = ("cv2", "numba", "pandas", "scipy.ndimage", "scipy.optimize", "skimage.feature",

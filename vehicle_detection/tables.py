@@ -509,7 +509,7 @@ def _parse_frames(cells: Sequence[Any], places: Sequence[str], error: type[Excep
             raise error(f"{place}: frame is empty; enter its number from 0 or its file name")
         if isinstance(cell, str):
             keys.append(cell)
-        elif isinstance(cell, bool) or not 0 <= float(cell) <= _MAX_ID or cell != int(cell):
+        elif isinstance(cell, bool) or not 0 <= cell <= _MAX_ID or cell != int(cell):
             raise error(f"{place}: frame must be a whole number from 0 or a name, got {describe(cell)}")
         else:
             keys.append(int(cell))
@@ -562,9 +562,10 @@ def parse_number(cell: Any, name: str, place: str, error: type[Exception] = Data
         if isinstance(cell, bool) or "_" in str(cell):  # Python reads 1_0 as 10
             raise ValueError
         value: float = int(cell) if isinstance(cell, (int, np.integer)) else float(cell)
+        finite = math.isfinite(value)
     except (TypeError, ValueError, OverflowError):
-        value = math.nan
-    if not math.isfinite(value):
+        value, finite = math.nan, False
+    if not finite:
         hint = "; use a decimal point" if re.fullmatch(r"\s*-?\d+,\d+\s*", str(cell)) else ""
         raise error(f"{place}: {name} must be a finite number, got {describe(cell)}{hint}")
     return value

@@ -16,7 +16,7 @@ from vehicle_detection.formats import read_labels
 READERS = [
     (load_model, ModelFileError, "VEHICLE_DETECTION_MAX_MODEL_BYTES"),
     (read_labels, DatasetError, "VEHICLE_DETECTION_MAX_TEXT_BYTES"),
-    (lambda path: read_camera(path, (720, 1280)), InvalidInputError, "VEHICLE_DETECTION_MAX_TEXT_BYTES"),
+    (read_camera, InvalidInputError, "VEHICLE_DETECTION_MAX_TEXT_BYTES"),
     (lambda path: load_patches(path, label=1), DatasetError, None),
 ]
 

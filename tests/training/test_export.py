@@ -40,7 +40,7 @@ def files(network):
 
 
 def run(content):
-    session = open_session(content, "test", n_jobs=1)
+    session = open_session(content, "test", jobs=1)
     (rows,) = session.run({"image": IMAGE[None]})
     session.close()
     return rows[0]
@@ -83,7 +83,7 @@ def test_the_file_is_the_same_again(network, files):
 
 
 def test_sides_of_the_input_are_free(files):
-    session = open_session(files[True], "test", n_jobs=1)
+    session = open_session(files[True], "test", jobs=1)
     for height, width in (32, 32), (96, 224), _CALIBRATION_SIZE[::-1]:
         (rows,) = session.run({"image": np.zeros((1, height, width, 3), np.uint8)})
         assert rows.shape[1] == 5
