@@ -17,10 +17,10 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 RESOLUTIONS = {"oldest": "lowest-direct", "newest": "highest"}
 TESTS = (
-    "tests/features", "tests/test_search.py", "tests/test_boxes.py", "tests/test_heatmap.py",
-    "tests/test_images.py", "tests/test_classifier.py", "tests/test_detector.py", "tests/network",
-    "tests/tracking", "tests/evaluation/test_readers.py", "tests/test_sklearn_models.py",
-    "tests/video/test_process.py", "tests/cli/test_cli.py",
+    "tests/test_features.py", "tests/test_search.py", "tests/test_boxes.py", "tests/test_heatmap.py",
+    "tests/test_images.py", "tests/test_svm.py", "tests/test_detector.py", "tests/network",
+    "tests/tracking", "tests/formats", "tests/test_sklearn_models.py", "tests/video/test_writing.py",
+    "tests/cli/test_app.py",
 )  # fmt: skip
 """Tests of the parts that depend most on other libraries."""
 
