@@ -21,14 +21,14 @@ def run(context: Context) -> list[Row]:
     images = np.resize(found.patches, (COUNT, *found.patches.shape[1:]))
     params = FeatureParams.preset("ycrcb-6156")
     sample = images[:: COUNT // SAMPLE][:SAMPLE]
-    fast = extract_features(sample, params, n_jobs=1)
+    fast = extract_features(sample, params, jobs=1)
     reference = np.empty(fast.shape)
 
     def by_reference() -> None:
         for index, patch in enumerate(sample):
             reference[index] = single_img_features(patch, params)
 
-    seconds = seconds_of(lambda: extract_features(images, params, n_jobs=1))
+    seconds = seconds_of(lambda: extract_features(images, params, jobs=1))
     slow = seconds_of(by_reference) * COUNT / SAMPLE
     return [
         Row(

@@ -46,7 +46,7 @@ def run(context: Context) -> list[Row]:
         ),
         "search_windows": (
             lambda: course.search_windows(frame, pairs, svc, scaler, "YCrCb", hog_channel="ALL"),
-            lambda: vd.search_windows(frame, windows, model, n_jobs=1),
+            lambda: vd.search_windows(frame, windows, model, jobs=1),
         ),
         "find_cars": (find_cars, lambda: search.find_windows(frame, bands)),
         "add_heat": (lambda: course.add_heat(heat, pairs), lambda: vd.add_heat(heat, windows)),

@@ -268,9 +268,9 @@ def test_threads_do_not_change_the_features(preset):
     params = FeatureParams.preset(preset)
     # More than two batches.
     patches = np.random.default_rng(3).integers(0, 256, (600, 64, 64, 3), dtype=np.uint8)
-    one = extract_features(patches, params, n_jobs=1)
-    for n_jobs in (2, 3):
-        np.testing.assert_array_equal(extract_features(patches, params, n_jobs=n_jobs), one)
+    one = extract_features(patches, params, jobs=1)
+    for jobs in (2, 3):
+        np.testing.assert_array_equal(extract_features(patches, params, jobs=jobs), one)
     for rows in (slice(590, None), slice(250, 260)):
         np.testing.assert_array_equal(extract_features(patches[rows], params), one[rows])
 

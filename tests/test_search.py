@@ -256,10 +256,10 @@ def small_params(**changes):
 def test_threads_do_not_change_the_result(params, templates):
     classifier = random_classifier(params, 2, templates=templates)
     search = small_params(horizontal_padding=0.3)
-    one = find_cars(IMAGE, classifier, search, n_jobs=1)
+    one = find_cars(IMAGE, classifier, search, jobs=1)
     assert len(one) > 10
-    for n_jobs in (2, 3):
-        found = find_cars(IMAGE, classifier, search, n_jobs=n_jobs)
+    for jobs in (2, 3):
+        found = find_cars(IMAGE, classifier, search, jobs=jobs)
         np.testing.assert_array_equal(found.boxes, one.boxes)
         np.testing.assert_array_equal(found.scores, one.scores)
 
@@ -268,7 +268,7 @@ def test_a_search_can_be_reused():
     classifier = random_classifier(SMALL)
     search = small_params()
     images = [textured(220, 330, seed) for seed in range(3)] + [textured(110, 165, 9)]
-    fresh = [find_cars(image, classifier, search, n_jobs=1) for image in images]
+    fresh = [find_cars(image, classifier, search, jobs=1) for image in images]
     with classifier.open_search(2) as bands:
         for image, expected in zip(images * 2, fresh * 2):
             found = bands.find_windows(image, search)
@@ -309,7 +309,7 @@ def test_many_threads_can_use_one_search(monkeypatch):
     classifier = random_classifier(SMALL)
     search = small_params()
     images = [textured(220, 330, seed) for seed in range(8)]
-    fresh = [find_cars(image, classifier, search, n_jobs=1) for image in images]
+    fresh = [find_cars(image, classifier, search, jobs=1) for image in images]
     with classifier.open_search(2) as bands, ThreadPoolExecutor(8) as callers:
         together = threading.Barrier(8)
 
@@ -338,7 +338,7 @@ def test_boxes_are_in_pixels_of_the_frame():
     )
     frame = textured(720, 1280, 2)
     (band,) = search.place(frame.shape)
-    found = find_cars(frame, classifier, search, n_jobs=1)
+    found = find_cars(frame, classifier, search, jobs=1)
     # 1280 / 128 and 384 / 96 are integers, so windows have exact sizes and steps are whole cells.
     np.testing.assert_array_equal(
         found.boxes[:, 2:] - found.boxes[:, :2], np.full((len(found), 2), (128, 96))
@@ -374,7 +374,7 @@ def test_windows_are_inside_the_band_and_have_its_window_size(shape, window, ove
     except InvalidInputError:
         return
     classifier = random_classifier(FeatureParams(hog_feat=False, hist_feat=False, spatial_size=8))
-    found = find_cars(np.zeros((*shape, 3), np.uint8), classifier, search, n_jobs=1)
+    found = find_cars(np.zeros((*shape, 3), np.uint8), classifier, search, jobs=1)
     assert len(found) >= 1
     slack = 1e-9 * max(shape)
     assert (found.boxes[:, :2] >= (placed.x1 - slack, placed.y1 - slack)).all()
@@ -402,7 +402,7 @@ def test_a_step_is_rounded_to_whole_cells(overlap, cells):
         bands=(SearchBand(window=(64, 64), y=(0, 64), overlap=(overlap, 0)),), min_score=-1e6
     )
     classifier = random_classifier(FeatureParams(hog_feat=False, spatial_feat=False))
-    found = find_cars(np.zeros((720, 1280, 3), np.uint8), classifier, search, n_jobs=1)
+    found = find_cars(np.zeros((720, 1280, 3), np.uint8), classifier, search, jobs=1)
     assert np.unique(np.diff(found.boxes[:, 0])).tolist() == [8.0 * cells]
 
 
@@ -470,8 +470,8 @@ def test_find_cars_rejects_other_classifiers_and_parameters():
 
 
 def test_find_cars_rejects_an_invalid_number_of_threads():
-    with pytest.raises(InvalidInputError, match="n_jobs must be an integer from 1"):
-        find_cars(IMAGE, random_classifier(SMALL), small_params(), n_jobs=0)
+    with pytest.raises(InvalidInputError, match="jobs must be an integer from 1"):
+        find_cars(IMAGE, random_classifier(SMALL), small_params(), jobs=0)
 
 
 def test_a_strided_frame_gives_the_same_result():

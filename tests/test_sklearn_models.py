@@ -105,7 +105,7 @@ def test_any_scaler_and_linear_classifier(patches, labels, scaler, classifier):
 
 
 def test_a_grid_search_over_the_features(patches, labels):
-    steps = (PatchFeatures(**dataclasses.asdict(SMALL), n_jobs=1), StandardScaler(), LinearSVC(C=1e-3))
+    steps = (PatchFeatures(**dataclasses.asdict(SMALL), jobs=1), StandardScaler(), LinearSVC(C=1e-3))
     grid = {"patchfeatures__orient": [5], "patchfeatures__spatial_order": ["interleaved"]}
     search = GridSearchCV(make_pipeline(*steps), grid, cv=2).fit(patches, labels)
     classifier = VehicleClassifier.from_pipeline(search)

@@ -213,7 +213,7 @@ def test_metadata_of_training(trained):
 
 def test_the_same_seed_gives_the_same_model(trained, patches, labels, tmp_path):
     before = patches.copy()
-    again = train_classifier(patches, labels, params=SMALL, metadata={"accuracy": 1.0}, n_jobs=1)
+    again = train_classifier(patches, labels, params=SMALL, metadata={"accuracy": 1.0}, jobs=1)
     np.testing.assert_array_equal(patches, before)
     trained.save(tmp_path / "a.safetensors")
     again.save(tmp_path / "b.safetensors")

@@ -165,8 +165,8 @@ def test_no_windows():
 
 def test_threads_and_order_do_not_change_scores():
     windows = slide_window(IMAGE, xy_window=(30, 30), xy_overlap=(0.8, 0.8))
-    one = search_windows(IMAGE, windows, CLASSIFIER, min_score=None, n_jobs=1)
-    two = search_windows(IMAGE, windows, CLASSIFIER, min_score=None, n_jobs=2)
+    one = search_windows(IMAGE, windows, CLASSIFIER, min_score=None, jobs=1)
+    two = search_windows(IMAGE, windows, CLASSIFIER, min_score=None, jobs=2)
     np.testing.assert_array_equal(one.scores, two.scores)
     backwards = search_windows(IMAGE, windows[::-1], CLASSIFIER, min_score=None)
     np.testing.assert_allclose(backwards.scores[::-1], one.scores, rtol=1e-9, atol=1e-9)

@@ -219,7 +219,7 @@ class _Valid:
         _, scaler, svc = (step for _, step in to_pipeline(classifier).steps)
         moving = moviepy.VideoClip(lambda time: image, duration=0.1)
         theirs = SimpleNamespace(xyxy=boxes, confidence=scores, class_id=None)
-        quick = vd.TrialOptions(time_search=False, n_jobs=1)
+        quick = vd.TrialOptions(time_search=False, jobs=1)
         table = _table()
         write_results(table, folder / "results.csv")
         lesson_only = {"spatial_feat": False, "hist_feat": False, "hog_channel": 0, "color_space": "YCrCb"}
@@ -233,7 +233,7 @@ class _Valid:
             "TrackTable": predicted, "FunctionParams": vd.FunctionParams(), "HeatHistory": vd.HeatHistory(),
             "FrameSource": vd.open_source(clip), "HeatmapDetector": vd.HeatmapDetector(classifier),
             "NetworkModel": vd.load_model("default"), "NetworkParams": vd.NetworkParams(),
-            "OwnSpeed": own_speed, "PatchFeatures": vd.PatchFeatures(n_jobs=1), "PatchSet": patch_set,
+            "OwnSpeed": own_speed, "PatchFeatures": vd.PatchFeatures(jobs=1), "PatchSet": patch_set,
             "Platt": vd.Platt(-1.0, 0.0),
             "ReportWriter": vd.ReportWriter(folder / "writer.html"),
             "SearchParams": search,
@@ -301,7 +301,7 @@ class _Valid:
             "bounding_boxes": {"params": None},
             "calibrate_scores": {"labels": [1, 0]},
             "calibration_error": {"probabilities": [0.2, 0.5], "labels": [0, 1], "bins": 5},
-            "compare_classifiers": {"classifiers": {"a": _small_tree()}, "params": params, "n_jobs": 1},
+            "compare_classifiers": {"classifiers": {"a": _small_tree()}, "params": params, "jobs": 1},
             "compare_configurations": {"configurations": {"a": params}, "options": quick},
             "detector_from": {"function": lambda image: (boxes, scores)},
             "draw_labeled_bboxes": {"labels": (heat.astype(np.int32), 0)},
@@ -313,15 +313,15 @@ class _Valid:
             "estimate_horizon": {"boxes": [[40 * n, 60, 30 + 40 * n + n, 90 + n] for n in range(1, 7)]},
             "evaluate_detections": {"labels": truth},
             "evaluate_tracks": {"labels": truth},
-            "extract_features": {"n_jobs": 1},
-            "find_cars": {"params": search, "n_jobs": 1},
+            "extract_features": {"jobs": 1},
+            "find_cars": {"params": search, "jobs": 1},
             "find_vehicles": {"params": None},
             "get_hog_features": {"img": image[..., 0]},
             "hog_image": {"img": image[..., 0]},
             "load_classifier": {"path": "highway"},
-            "load_patches": {"source": folder / "patches", "label": 1, "n_jobs": 1},
+            "load_patches": {"source": folder / "patches", "label": 1, "jobs": 1},
             "load_training_patches": {"vehicles": folder / "patches", "non_vehicles": folder / "patches"},
-            "mine_negatives": {"labels": truth, "search_params": search, "n_jobs": 1},
+            "mine_negatives": {"labels": truth, "search_params": search, "jobs": 1},
             "open_source": {"source": clip},
             "precision_recall_curve": {"labels": truth},
             "probe_video": {"path": clip},
@@ -340,16 +340,16 @@ class _Valid:
                 "model": "highway",
                 "progress": False,
                 "tracks_only": True,
-                "options": {"n_jobs": 1},
+                "options": {"jobs": 1},
             },
             "search_parameters": {"grid": {"orient": [4]}, "halving": Halving(n_folds=2), "options": quick},
-            "search_windows": {"windows": boxes, "n_jobs": 1},
+            "search_windows": {"windows": boxes, "jobs": 1},
             "single_img_features": {"image": patches[0]},
             "split_random": {"patches_or_labels": labels},
             "split_sources": {"train": ("a",), "test": ("b",)},
             "track": {"source": clip, "detector": detector},
-            "train_and_evaluate": {"params": params, "seeds": 1, "n_jobs": 1},
-            "train_classifier": {"labels": labels, "params": params, "n_jobs": 1},
+            "train_and_evaluate": {"params": params, "seeds": 1, "jobs": 1},
+            "train_classifier": {"labels": labels, "params": params, "jobs": 1},
             "write_camera": {"path": folder / "out.json"},
             "write_image": {"path": folder / "out.png"},
             "write_labels": {"labels": truth},

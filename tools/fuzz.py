@@ -202,7 +202,7 @@ def archive_cases(folder: Path, rng: random.Random) -> Iterator[Case]:
             for name in rng.sample(names, rng.randrange(3)):
                 archive.writestr(name, rng.choice((patch, b"", bytes(100_000))))
         file.write_bytes(mutate(buffer.getvalue(), rng) if rng.random() < 0.8 else buffer.getvalue())
-        yield "archive", partial(vd.load_patches, file, label=1, n_jobs=1)
+        yield "archive", partial(vd.load_patches, file, label=1, jobs=1)
 
 
 def video_cases(folder: Path, rng: random.Random) -> Iterator[Case]:

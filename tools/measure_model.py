@@ -78,9 +78,7 @@ def _only(source: FrameDataset, rides: Collection[str]) -> FrameDataset:
     return FrameDataset(source.name, tuple(select_frames(part, rides) for part in source.sets))
 
 
-def measure(
-    model: Any, sources: Iterable[FrameDataset], *, n_jobs: int | None = None
-) -> list[dict[str, Any]]:
+def measure(model: Any, sources: Iterable[FrameDataset], *, jobs: int | None = None) -> list[dict[str, Any]]:
     """Score a model on each set of frames at its own threshold, and on the frames of `RIDES` also by light.
 
     Returns
@@ -93,7 +91,7 @@ def measure(
     log_odds = (-calibration.a, -calibration.b) if calibration is not None else (1.0, 0.0)
     rows = []
     for source in sources:
-        for fold in detect_in_source(model, source, n_jobs=n_jobs):
+        for fold in detect_in_source(model, source, jobs=jobs):
             parts = [fold, *(by_light(fold) if source.name == RIDES else ())]
             rows += [score_fold(part, 0.0, log_odds).to_dict() for part in parts]
     return rows
@@ -145,7 +143,7 @@ def _measure(options: argparse.Namespace) -> None:
     names = [name for name in options.sources.split(",") if name]
     sources = choose_sources(options.data, names, rides)
     model = load_model(options.model)
-    rows = measure(model, sources, n_jobs=options.jobs)
+    rows = measure(model, sources, jobs=options.jobs)
     print(format_rows(rows))
     if options.output is not None:
         write_text(

@@ -23,14 +23,14 @@ SCENES = {"day": 22, "dusk": 29, "night, rain": 38}
 """Names of the shown scenes, and their numbers in `rendered_source`."""
 
 
-def make_picture(path: Path, *, n_jobs: int | None = None) -> None:
+def make_picture(path: Path, *, jobs: int | None = None) -> None:
     """Write the picture."""
     (scenes,) = rendered_source(frames=max(SCENES.values()) + 1, random_state=SEED).sets
     rendered = {key: image for key, image in scenes if key in SCENES.values()}
     images = {name: rendered[key] for name, key in SCENES.items()}
     found = {}
     for model in "highway", "default":
-        with VehicleDetector(model, jobs=n_jobs) as detector:
+        with VehicleDetector(model, jobs=jobs) as detector:
             found[model] = [detector.detect(image) for image in images.values()]
     truth = [scenes.labels.frame(key) for key in SCENES.values()]
     figure = Figure(figsize=(10, 9), layout="constrained")

@@ -75,14 +75,12 @@ def load_sources(folder: Path, *, held_out: bool = False) -> list[FrameDataset]:
     return [FrameDataset(RIDES, (select_frames(rides, set(rides.keys) - kept),)), course]
 
 
-def evaluate_held_out(
-    model: NetworkModel, folder: Path, *, n_jobs: int | None = None
-) -> list[FoldDetections]:
+def evaluate_held_out(model: NetworkModel, folder: Path, *, jobs: int | None = None) -> list[FoldDetections]:
     """Detect vehicles with the network for the measurements in the frames that it has not seen."""
     rides, *sources = choose_sources(folder, (RIDES, *LEFT_OUT))
     (part,) = rides.sets
     kept = FrameDataset(RIDES, (select_frames(part, set(kept_rides(part.labels["frame"]))),))
-    return detect_logits(model, [kept, *sources], n_jobs=n_jobs)
+    return detect_logits(model, [kept, *sources], jobs=jobs)
 
 
 def make_file(
@@ -154,7 +152,7 @@ def _train(options: argparse.Namespace) -> None:
     parts = [*sources, rendered]
     frames = load_training_frames(parts, max_side=_MAX_SIDE)
     measured = _network(options, options.held_out_weights, frames, "held-out")
-    folds = evaluate_held_out(load_content(make_file(measured, frames)), options.data, n_jobs=options.jobs)
+    folds = evaluate_held_out(load_content(make_file(measured, frames)), options.data, jobs=options.jobs)
     network, sources = measured, parts
     if not options.held_out:
         sources = [*load_sources(options.data), rendered]
@@ -180,7 +178,7 @@ def _network(
         NetworkTraining(steps=options.steps, random_state=options.seed),
         initial=None if options.init is None else load_weights(options.init),
         device=options.device,
-        n_jobs=options.jobs,
+        jobs=options.jobs,
         checkpoint=checkpoint,
         on_step=lambda _, line: print(f"{name} network, {line}", flush=True),
     )

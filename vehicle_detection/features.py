@@ -472,7 +472,7 @@ def extract_features(
     source: Any,
     params: FeatureParams | None = None,
     *,
-    n_jobs: int | None = None,
+    jobs: int | None = None,
     progress: bool = False,
 ) -> NDArray[np.float32]:
     """Feature vectors of many patches, equal to those of `single_img_features`.
@@ -486,7 +486,7 @@ def extract_features(
         files.
     params
         Features to compute; the default is ``FeatureParams()``.
-    n_jobs
+    jobs
         Number of threads, without effect on the result; None uses ``VEHICLE_DETECTION_JOBS`` or all cores.
     progress
         Show a progress bar on standard error.
@@ -507,7 +507,7 @@ def extract_features(
 
     with (
         progress_bar(progress, len(patches), unit="patch", desc="features") as bar,
-        ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool,
+        ThreadPoolExecutor(resolve_jobs(jobs)) as pool,
     ):
         for count in pool.map(run, batches):
             bar.update(count)

@@ -293,8 +293,8 @@ class FrameSearch(Closing, ABC):
 
     params_type: ClassVar[type[Any]]
 
-    def __init__(self, n_jobs: int | None) -> None:
-        self._team = ThreadTeam(n_jobs, name="search")
+    def __init__(self, jobs: int | None) -> None:
+        self._team = ThreadTeam(jobs, name="search")
         self.workspace = Workspace()
 
     def find(
@@ -338,8 +338,8 @@ class BandSearch(FrameSearch):
 
     params_type = SearchParams
 
-    def __init__(self, filters: BandFilters, n_jobs: int | None = None) -> None:
-        super().__init__(n_jobs)
+    def __init__(self, filters: BandFilters, jobs: int | None = None) -> None:
+        super().__init__(jobs)
         self.filters = filters
 
     def _search(

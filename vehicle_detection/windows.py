@@ -103,7 +103,7 @@ def search_windows(
     classifier: VehicleClassifier,
     *,
     min_score: float | None = 0.0,
-    n_jobs: int | None = None,
+    jobs: int | None = None,
 ) -> Detections:
     """Classify each window of a list, of any size, as a patch.
 
@@ -119,7 +119,7 @@ def search_windows(
         Scores the windows, cropped and resized to 64x64.
     min_score
         Minimum score of the returned windows (exclusive); None returns all.
-    n_jobs
+    jobs
         Threads.
     """
     check_image(image)
@@ -146,7 +146,7 @@ def search_windows(
     patches = np.empty((len(boxes), PATCH_SIZE, PATCH_SIZE, 3), np.uint8)
     for patch, (x1, y1, x2, y2) in zip(patches, boxes):
         cv2.resize(image[y1:y2, x1:x2], (PATCH_SIZE, PATCH_SIZE), dst=patch)
-    features = extract_features(patches, classifier.params, n_jobs=n_jobs)
+    features = extract_features(patches, classifier.params, jobs=jobs)
     scores = classifier.decision_function(features)
     found = Detections(boxes, scores)
     return found if min_score is None else found[scores > min_score]
@@ -157,7 +157,7 @@ def find_cars(
     classifier: VehicleClassifier,
     params: SearchParams | None = None,
     *,
-    n_jobs: int | None = None,
+    jobs: int | None = None,
 ) -> Detections:
     """Find the windows of a frame that look like vehicles.
 
@@ -175,7 +175,7 @@ def find_cars(
     params
         Bands and minimum score; the default is ``SearchParams.preset("default")``. Steps between windows
         are rounded to whole cells, at least one.
-    n_jobs
+    jobs
         Threads, each of which searches a band; the result does not depend on them.
 
     Examples
@@ -185,5 +185,5 @@ def find_cars(
     0
     """
     check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
-    with classifier.open_search(n_jobs) as search:
+    with classifier.open_search(jobs) as search:
         return search.find_windows(image, SearchParams.preset() if params is None else params)

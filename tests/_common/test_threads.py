@@ -54,10 +54,10 @@ def test_an_invalid_environment_variable(monkeypatch, text):
         resolve_jobs()
 
 
-@pytest.mark.parametrize("n_jobs", [0, -1, 1025, 2.0, "2", True])
-def test_an_invalid_number_of_threads(n_jobs):
-    with pytest.raises(InvalidInputError, match=r"^n_jobs must be an integer from 1 to 1024; got"):
-        resolve_jobs(n_jobs)
+@pytest.mark.parametrize("jobs", [0, -1, 1025, 2.0, "2", True])
+def test_an_invalid_number_of_threads(jobs):
+    with pytest.raises(InvalidInputError, match=r"^jobs must be an integer from 1 to 1024; got"):
+        resolve_jobs(jobs)
 
 
 @pytest.mark.usefixtures("three_threads")

@@ -136,9 +136,9 @@ def test_the_order_in_the_zip_does_not_matter(vehicles_zip, tmp_path):
     assert load_patches(backwards).names == load_patches(vehicles_zip).names
 
 
-@pytest.mark.parametrize("n_jobs", [1, 2, 7])
-def test_the_number_of_threads_does_not_matter(vehicles_zip, n_jobs):
-    patches = load_patches(vehicles_zip, n_jobs=n_jobs)
+@pytest.mark.parametrize("jobs", [1, 2, 7])
+def test_the_number_of_threads_does_not_matter(vehicles_zip, jobs):
+    patches = load_patches(vehicles_zip, jobs=jobs)
     np.testing.assert_array_equal(patches.patches, load_patches(vehicles_zip).patches)
 
 
@@ -201,7 +201,7 @@ def test_patches_of_another_size_are_named(tmp_path):
     ("options", "message"),
     [
         ({"size": 0}, "size must be an integer from 1 to 4096; got 0"),
-        ({"n_jobs": 0}, "n_jobs must be an integer from 1 to 1024; got 0"),
+        ({"jobs": 0}, "jobs must be an integer from 1 to 1024; got 0"),
     ],
 )
 def test_invalid_options(vehicles_zip, options, message):

@@ -34,8 +34,8 @@ def model(file):
     return load_network(file, runtime="onnxruntime")
 
 
-def find(model, image=IMAGE, params=None, *, n_jobs=1, score=0.0):
-    with model.open_search(jobs=n_jobs) as search:
+def find(model, image=IMAGE, params=None, *, jobs=1, score=0.0):
+    with model.open_search(jobs=jobs) as search:
         return search.find(image, params, min_vehicle_score=score)
 
 
@@ -90,8 +90,8 @@ def test_a_lower_threshold_finds_more(model):
 
 def test_the_result_depends_on_nothing_but_the_frame(model):
     one = find(model)
-    for n_jobs in (1, 2, 3):
-        check_equal(one, find(model, n_jobs=n_jobs))
+    for jobs in (1, 2, 3):
+        check_equal(one, find(model, jobs=jobs))
     image = IMAGE.copy()
     check_equal(one, find(model, image[::1]))
     np.testing.assert_array_equal(image, IMAGE)
@@ -199,7 +199,7 @@ def test_malformed_frames(model, image, remedy):
 
 
 def test_malformed_arguments(model, tmp_path):
-    with pytest.raises(InvalidInputError, match="n_jobs"):
+    with pytest.raises(InvalidInputError, match="jobs"):
         model.open_search(jobs=0)
     with pytest.raises(InvalidInputError, match="params must be a NetworkParams"):
         find(model, params=HeatParams())

@@ -139,7 +139,7 @@ def test_a_given_heat_map_is_used():
 @pytest.mark.realdata
 def test_windows_and_heat_of_a_real_frame(real_data):
     image = read_image(real_data / "test_images" / "test1.jpg")
-    windows = find_cars(image, load_classifier(), n_jobs=1)
+    windows = find_cars(image, load_classifier(), jobs=1)
     figure = notebook.plot_heatmap(image, windows)
     assert len(figure.axes[2].collections[0].get_segments()) >= 2
     axes = notebook.plot_windows(image, windows, ax=new_axes())

@@ -47,7 +47,7 @@ def small_samples(monkeypatch):
 
 
 def tune(initial, sources=SOURCES, **options):
-    options = {"steps": 3, "n_jobs": 1, "device": "cpu"} | options
+    options = {"steps": 3, "jobs": 1, "device": "cpu"} | options
     return fine_tune_network(sources, initial=initial, **options)
 
 
@@ -85,7 +85,7 @@ def test_an_interrupted_training_continues_and_writes_the_same_file(initial, tmp
 def test_many_held_out_vehicles_set_calibration_and_threshold(initial, monkeypatch):
     monkeypatch.setattr(fine_tune, "best_threshold", lambda folds: -1.0)
     model = load_network(initial)
-    folds = detect_logits(model, SOURCES, n_jobs=1)
+    folds = detect_logits(model, SOURCES, jobs=1)
     for minimum, slope, expected in (1, 2.0, (2.0, 0.5, -1.5)), (1, 99.0, None), (50, 2.0, None):
         monkeypatch.setattr(fine_tune, "_MIN_VEHICLES", minimum)
         monkeypatch.setattr(fine_tune, "fit_log_odds", lambda folds, slope=slope: (slope, 0.5))

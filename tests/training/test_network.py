@@ -30,7 +30,7 @@ def report_each_step(monkeypatch):
 
 
 def train(frames, training=TRAINING, **options):
-    return train_network(frames, training, device="cpu", n_jobs=1, **options).state_dict()
+    return train_network(frames, training, device="cpu", jobs=1, **options).state_dict()
 
 
 def assert_equal(one, other):

@@ -124,7 +124,7 @@ def test_training_again_writes_the_same_file(patch_set, tmp_path, split):
             params=SMALL,
             split=split,
             seeds=1,
-            n_jobs=jobs,
+            jobs=jobs,
             options=TrainingOptions(random_state=5),
         )
         classifier.save(tmp_path / name)
@@ -245,7 +245,7 @@ def test_the_card_of_own_patches_does_not_mention_the_course():
             {"options": TrainingOptions(random_state=2**32 - 1)},
             "random_state must be an integer from 0 to 4294967291",
         ),
-        ({"n_jobs": 0}, "n_jobs must be an integer from 1"),
+        ({"jobs": 0}, "jobs must be an integer from 1"),
     ],
 )
 def test_invalid_options(patch_set, options, message):

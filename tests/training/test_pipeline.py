@@ -17,7 +17,7 @@ from vehicle_detection.training import PatchFeatures
 
 
 def test_the_transformer_equals_extract_features():
-    transformer = PatchFeatures(color_space="LUV", orient=6, n_jobs=1)
+    transformer = PatchFeatures(color_space="LUV", orient=6, jobs=1)
     params = FeatureParams(color_space="LUV", orient=6)
     assert transformer.to_params() == params
     expected = extract_features(PATCHES, params)
@@ -28,7 +28,7 @@ def test_the_transformer_equals_extract_features():
 
 def test_the_transformer_has_the_fields_and_defaults_of_feature_params():
     arguments = PatchFeatures().get_params()
-    assert arguments.pop("n_jobs") is None
+    assert arguments.pop("jobs") is None
     assert arguments == dataclasses.asdict(FeatureParams())
 
 
@@ -121,7 +121,7 @@ def test_the_transformer_states_that_it_needs_no_tables_and_no_fit():
 
 
 def test_the_transformer_depends_on_each_patch_alone():
-    transformer = PatchFeatures(n_jobs=1)
+    transformer = PatchFeatures(jobs=1)
     expected = transformer.fit_transform(PATCHES)
     order = np.random.default_rng(0).permutation(len(PATCHES))
     np.testing.assert_array_equal(transformer.transform(PATCHES[order]), expected[order])
@@ -134,17 +134,17 @@ def test_the_transformer_leaves_its_input_alone_and_can_be_pickled():
     before = PATCHES.copy()
     frozen = np.asfortranarray(PATCHES)
     frozen.setflags(write=False)
-    transformer = PatchFeatures(n_jobs=1)
+    transformer = PatchFeatures(jobs=1)
     expected = transformer.transform(PATCHES)
     np.testing.assert_array_equal(transformer.transform(frozen), expected)
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(transformer)).transform(frozen), expected)
     np.testing.assert_array_equal(PATCHES, before)
-    assert vars(transformer) == vars(PatchFeatures(n_jobs=1))
+    assert vars(transformer) == vars(PatchFeatures(jobs=1))
 
 
 def test_the_transformer_in_cross_validation():
     patches, labels = rendered_patches(40)
-    features = PatchFeatures(spatial_size=8, orient=6, hog_channel=0, n_jobs=1)
+    features = PatchFeatures(spatial_size=8, orient=6, hog_channel=0, jobs=1)
     pipeline = make_pipeline(features, StandardScaler(), LinearSVC(C=1e-3, random_state=0))
     assert cross_val_score(pipeline, patches, labels, cv=4, error_score="raise").mean() >= 0.9
     named = make_pipeline(features).set_output(transform="pandas").fit_transform(patches[:2])
@@ -155,7 +155,7 @@ def test_the_transformer_in_a_grid_search():
     patches = np.concatenate([PATCHES[:4]] * 2 + [PATCHES[5:9]] * 2)
     labels = np.repeat([1, 0], 8)
     pipeline = make_pipeline(
-        PatchFeatures(spatial_size=8, hist_bins=8, n_jobs=1),
+        PatchFeatures(spatial_size=8, hist_bins=8, jobs=1),
         StandardScaler(),
         LinearSVC(C=1e-3, random_state=0),
     )

@@ -202,7 +202,7 @@ def test_detections_of_any_model():
     model = detector_from(find).model
     fold = fold_of([], [])
     source = FrameDataset("road", (fold.frames, fold.frames))
-    first, second = detect_in_source(model, source, n_jobs=2)
+    first, second = detect_in_source(model, source, jobs=2)
     assert len(seen) == 8
     assert (first.source, first.predictions.frame_keys) == ("road", (0, 1, 2, 3))
     np.testing.assert_array_equal(first.predictions.boxes, second.predictions.boxes)

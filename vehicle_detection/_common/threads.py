@@ -94,10 +94,10 @@ def _read_cpu_quotas(root: Path) -> Iterator[float]:
             yield quota / period
 
 
-def resolve_jobs(n_jobs: int | None = None) -> int:
-    """Return `n_jobs`, else the environment variable ``VEHICLE_DETECTION_JOBS``, else all cores."""
-    if n_jobs is not None:
-        return check_integer(n_jobs, "n_jobs", low=1, high=_MAX_JOBS)
+def resolve_jobs(jobs: int | None = None) -> int:
+    """Return `jobs`, else the environment variable ``VEHICLE_DETECTION_JOBS``, else all cores."""
+    if jobs is not None:
+        return check_integer(jobs, "jobs", low=1, high=_MAX_JOBS)
     text = os.environ.get(JOBS_VARIABLE, "")
     if not text:
         return available_cores()
@@ -140,10 +140,10 @@ if hasattr(os, "register_at_fork"):
 
 
 class ThreadTeam:
-    """`n_jobs` threads, including the calling one, that process a list of items; kept for the next list."""
+    """`jobs` threads, including the calling one, that process a list of items; kept for the next list."""
 
-    def __init__(self, n_jobs: int | None = None, *, name: str) -> None:
-        self._helpers = resolve_jobs(n_jobs) - 1
+    def __init__(self, jobs: int | None = None, *, name: str) -> None:
+        self._helpers = resolve_jobs(jobs) - 1
         self._name = name
         self._pool: ThreadPoolExecutor | None = None
         self._lock = threading.Lock()

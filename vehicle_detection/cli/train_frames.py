@@ -52,7 +52,7 @@ def train_frames(
             initial=model,
             steps=steps,
             random_state=seed,
-            n_jobs=jobs,
+            jobs=jobs,
             device=device,
             checkpoint=checkpoint,
             on_step=lambda _, line: print_line(line),

@@ -175,11 +175,11 @@ def infer_labels(listing: Listing) -> NDArray[np.bool_]:
 
 
 def decode_listings(
-    listings: Sequence[Listing], *, size: int, n_jobs: int | None, progress: bool
+    listings: Sequence[Listing], *, size: int, jobs: int | None, progress: bool
 ) -> NDArray[np.uint8]:
     """Decode all images into one ``(N, size, size, 3)`` array, in the order of the listings."""
     check_integer(size, "size", low=1, high=4096)
-    jobs = resolve_jobs(n_jobs) if n_jobs is not None else min(resolve_jobs(None), 8)
+    jobs = resolve_jobs(jobs) if jobs is not None else min(resolve_jobs(None), 8)
     total = sum(len(listing.names) for listing in listings)
     patches = np.empty((total, size, size, 3), np.uint8)
     # OpenCV releases the GIL, so threads suffice. Each decodes a range of rows, as opening a zip takes time.

@@ -163,7 +163,7 @@ def load_patches(
     *,
     label: int | None = None,
     size: int = PATCH_SIZE,
-    n_jobs: int | None = None,
+    jobs: int | None = None,
     progress: bool = False,
 ) -> PatchSet:
     """Read all patches (PNG, JPEG) in a folder or zip file.
@@ -180,7 +180,7 @@ def load_patches(
     label
         1 for vehicles, 0 for non-vehicles. None takes the label from the innermost folder named
         ``vehicles``, ``cars``, ``non-vehicles`` or ``notcars``.
-    size, n_jobs, progress
+    size, jobs, progress
         Side in pixels that every patch must have; threads, None for one per core, at most 8; and whether to
         show a progress bar on standard error.
 
@@ -205,7 +205,7 @@ def load_patches(
     check_choice(label, "label", (None, 0, 1))
     listing = list_patches(source, "source")
     labels = infer_labels(listing) if label is None else np.full(len(listing.names), bool(label))
-    patches = decode_listings([listing], size=size, n_jobs=n_jobs, progress=progress)
+    patches = decode_listings([listing], size=size, jobs=jobs, progress=progress)
     return PatchSet(patches, labels, listing.names)
 
 
@@ -213,7 +213,7 @@ def load_training_patches(
     vehicles: str | os.PathLike[str],
     non_vehicles: str | os.PathLike[str],
     *,
-    n_jobs: int | None = None,
+    jobs: int | None = None,
     progress: bool = False,
 ) -> PatchSet:
     """Read both classes into one set, vehicles first; the arguments are what `fetch_patches` returns.
@@ -222,7 +222,7 @@ def load_training_patches(
 
     Parameters
     ----------
-    vehicles, non_vehicles, n_jobs, progress
+    vehicles, non_vehicles, jobs, progress
         A folder or zip file for each class; the others as in `load_patches`.
 
     Raises
@@ -238,6 +238,6 @@ def load_training_patches(
     vehicle_detection.errors.DatasetError: vehicles v.zip does not exist; check the path, ...
     """
     listings = [list_patches(vehicles, "vehicles"), list_patches(non_vehicles, "non_vehicles")]
-    patches = decode_listings(listings, size=PATCH_SIZE, n_jobs=n_jobs, progress=progress)
+    patches = decode_listings(listings, size=PATCH_SIZE, jobs=jobs, progress=progress)
     names, others = (listing.names for listing in listings)
     return PatchSet(patches, np.arange(len(patches)) < len(names), names + others)

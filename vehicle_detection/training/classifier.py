@@ -91,7 +91,7 @@ def train_classifier(
     params: FeatureParams | None = None,
     options: TrainingOptions | None = None,
     estimator: Any = None,
-    n_jobs: int | None = None,
+    jobs: int | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> VehicleClassifier:
     """Train a linear SVM behind a feature scaler on patches, or another linear classifier of scikit-learn.
@@ -114,7 +114,7 @@ def train_classifier(
     estimator
         An unfitted scikit-learn classifier with linear scores, such as ``LogisticRegression(C=0.01)``, that
         replaces the SVM and its `C`.
-    n_jobs
+    jobs
         Threads of the feature extraction.
     metadata
         JSON values to keep in the model file.
@@ -130,7 +130,7 @@ def train_classifier(
     if metadata is not None:
         check_type(metadata, "metadata", Mapping, "pass a dictionary")
     images, targets = _read_training_set(patches, labels)
-    features = patch_features(images, params, options, n_jobs=n_jobs)
+    features = patch_features(images, params, options, jobs=jobs)
     return fit_features(features, targets, params, options, estimator=estimator, metadata=metadata)
 
 
@@ -151,12 +151,12 @@ def _read_training_set(patches: Any, labels: ArrayLike | None) -> tuple[NDArray[
 
 
 def patch_features(
-    images: NDArray[np.uint8], params: FeatureParams, options: TrainingOptions, *, n_jobs: int | None = None
+    images: NDArray[np.uint8], params: FeatureParams, options: TrainingOptions, *, jobs: int | None = None
 ) -> NDArray[np.float32]:
     """Features of all patches, followed by those of their mirrored, blurred and degraded copies."""
     features = np.empty((len(options.copy_weights), len(images), params.length), np.float32)
     for rows, variant in zip(features, _augmented_copies(images, options)):
-        rows[:] = extract_features(variant, params, n_jobs=n_jobs)
+        rows[:] = extract_features(variant, params, jobs=jobs)
     return features.reshape(-1, params.length)
 
 

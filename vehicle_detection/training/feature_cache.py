@@ -47,7 +47,7 @@ class FeatureCache:
 
     `patches` is ``(N, 64, 64, 3)`` uint8 RGB. `folder` keeps one ``.npy`` file per parameter set
     (N x length x 4 bytes) between runs; None keeps features in memory only. Beyond `memory_mb` megabytes the
-    least recently used sets are dropped, but one set is always kept. `n_jobs` is the number of threads.
+    least recently used sets are dropped, but one set is always kept. `jobs` is the number of threads.
 
     >>> cache = FeatureCache(np.zeros((3, 64, 64, 3), np.uint8))
     >>> cache.all(FeatureParams()) is cache.all(FeatureParams())
@@ -60,13 +60,13 @@ class FeatureCache:
         *,
         folder: str | os.PathLike[str] | None = None,
         memory_mb: float = 2000.0,
-        n_jobs: int | None = None,
+        jobs: int | None = None,
     ) -> None:
         self.patches = check_patches(patches, PATCH_SIZE)
         self.digest = digest_of(self.patches)
         self._folder = None if folder is None else check_path(folder, "cache", kind="a folder")
         self._max_bytes = check_number(memory_mb, "memory_mb", low=0) * 1e6
-        self._n_jobs = n_jobs
+        self._jobs = jobs
         self._in_memory: OrderedDict[tuple[FeatureParams, bool], NDArray[np.float32]] = OrderedDict()
         try:
             if self._folder is not None:
@@ -105,7 +105,7 @@ class FeatureCache:
         patches = self.patches[rows]
         if mirrored:
             patches = np.ascontiguousarray(patches[:, :, ::-1])
-        return extract_features(patches, params, n_jobs=self._n_jobs)
+        return extract_features(patches, params, jobs=self._jobs)
 
     def _path(self, params: FeatureParams, mirrored: bool) -> Path | None:
         if self._folder is None:

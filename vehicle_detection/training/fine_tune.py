@@ -79,7 +79,7 @@ def fine_tune_network(
     initial: str | os.PathLike[str] = "default",
     steps: int | None = None,
     random_state: int = 0,
-    n_jobs: int | None = None,
+    jobs: int | None = None,
     device: str | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     on_step: Callable[[int, str], object] | None = None,
@@ -100,7 +100,7 @@ def fine_tune_network(
         Steps of 8 samples; None takes 5 for each frame, 200 to 1200. A step takes 0.6 s on two cores.
     random_state
         Seed of the samples.
-    n_jobs
+    jobs
         Threads, and processes that draw samples on CUDA.
     device
         ``"cpu"`` or ``"cuda"``; None takes CUDA where PyTorch offers it. The same seed on the same kind of
@@ -145,12 +145,12 @@ def fine_tune_network(
         frozen_statistics=True,
         data=f"{fingerprint(kept)} {hashlib.sha256(model.graph).hexdigest()}",
     )
-    before = [score_logits(fold, model) for fold in detect_logits(model, held_out, n_jobs=n_jobs)]
+    before = [score_logits(fold, model) for fold in detect_logits(model, held_out, jobs=jobs)]
     trained = train_network(
-        frames, training, initial=network, device=place, n_jobs=n_jobs, checkpoint=path, on_step=on_step
+        frames, training, initial=network, device=place, jobs=jobs, checkpoint=path, on_step=on_step
     )
     tuned = load_content(export_network(trained, frames, file_params(model), {}))
-    folds = detect_logits(tuned, held_out, n_jobs=n_jobs)
+    folds = detect_logits(tuned, held_out, jobs=jobs)
     tuned = _calibrate(tuned, folds)
     after = [score_logits(fold, tuned) for fold in folds]
     metadata = _metadata(checked, held_out, training, place, (before, after))
@@ -258,11 +258,11 @@ def load_content(content: bytes, name: str = "the trained network") -> NetworkMo
 
 
 def detect_logits(
-    model: NetworkModel, sources: Sequence[FrameDataset], *, n_jobs: int | None = None
+    model: NetworkModel, sources: Sequence[FrameDataset], *, jobs: int | None = None
 ) -> list[FoldDetections]:
     """Detect vehicles in all frames; the scores are the log-odds of the network without calibration."""
     plain = dataclasses.replace(model, slope=1.0, offset=0.0, threshold=0.0)
-    return [fold for source in sources for fold in detect_in_source(plain, source, n_jobs=n_jobs)]
+    return [fold for source in sources for fold in detect_in_source(plain, source, jobs=jobs)]
 
 
 def score_logits(fold: FoldDetections, model: NetworkModel) -> FoldScore:

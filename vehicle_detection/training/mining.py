@@ -33,7 +33,7 @@ def mine_negatives(
     max_overlap: float = 0.5,
     max_per_frame: int | None = None,
     source: str = "mined",
-    n_jobs: int | None = None,
+    jobs: int | None = None,
 ) -> PatchSet:
     """Cut the false positive windows of labelled frames out as training patches.
 
@@ -50,7 +50,7 @@ def mine_negatives(
     frames, labels
         Images by key, a list of images with their numbers as keys, or the frames of `load_frames`; and their
         true boxes. A frame without a box counts as empty.
-    classifier, n_jobs
+    classifier, jobs
         The model whose false positives are collected, and the threads of its search.
     search_params, min_score
         Where and at which sizes to search, by default ``SearchParams.preset()``; windows above the score are
@@ -77,7 +77,7 @@ def mine_negatives(
     params = dataclasses.replace(given, min_score=check_number(min_score, "min_score"))
     patches: list[NDArray[np.uint8]] = []
     names: list[str] = []
-    with contextlib.closing(classifier.open_search(n_jobs)) as search:
+    with contextlib.closing(classifier.open_search(jobs)) as search:
         for key, image in labelled:
             windows = search.find(image, params).windows
             labelled_boxes = labelled.labels.frame(key).boxes

@@ -72,7 +72,7 @@ def train_network(
     *,
     initial: Network | None = None,
     device: str | None = None,
-    n_jobs: int | None = None,
+    jobs: int | None = None,
     checkpoint: Path | None = None,
     on_step: Callable[[int, str], object] | None = None,
 ) -> Network:
@@ -88,7 +88,7 @@ def train_network(
         Network to continue from; None starts with random weights.
     device
         ``"cuda"`` or ``"cpu"``; None takes CUDA where PyTorch offers it.
-    n_jobs
+    jobs
         Processes that draw samples, and threads of a training on the processor.
     checkpoint
         File that the state of the training is written to, and from which an interrupted training continues.
@@ -108,7 +108,7 @@ def train_network(
     if not any(len(frame.boxes) for frame in frames):
         raise InvalidInputError("frames must show at least one vehicle; label some, and pass their labels")
     place = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    jobs = resolve_jobs(n_jobs)
+    jobs = resolve_jobs(jobs)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(training.random_state)
         network = copy.deepcopy(initial) if initial is not None else Network()

@@ -133,7 +133,7 @@ def train_and_evaluate(
     options: TrainingOptions | None = None,
     split: Literal["random", "sequences"] = "random",
     seeds: int = 5,
-    n_jobs: int | None = None,
+    jobs: int | None = None,
     progress: bool = False,
 ) -> tuple[VehicleClassifier, TrainingReport]:
     """Evaluate a classifier on several splits, then train it on all patches.
@@ -151,7 +151,7 @@ def train_and_evaluate(
         Split whose accuracy is reported as the model's. Others are skipped if the patches do not allow them.
     seeds
         Number of random splits.
-    n_jobs
+    jobs
         Threads; the result does not depend on them.
     progress
         Show a progress bar if standard error is a terminal.
@@ -183,9 +183,9 @@ def train_and_evaluate(
     inner = _inner_split(patch_set, splits["sequences"][0]) if "sequences" in splits else None
     seconds: dict[str, float] = {}
     n_fits = sum(map(len, splits.values())) + (inner is not None) + 1
-    with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool, _timed_steps(progress, n_fits, seconds) as step:
+    with ThreadPoolExecutor(resolve_jobs(jobs)) as pool, _timed_steps(progress, n_fits, seconds) as step:
         with step("features", fits=0):
-            features = patch_features(patch_set.patches, params, options, n_jobs=n_jobs)
+            features = patch_features(patch_set.patches, params, options, jobs=jobs)
 
         def train(name: str, rows: NDArray[np.intp] | None = None) -> VehicleClassifier:
             with step(name):

@@ -21,7 +21,7 @@ from vehicle_detection.svm import VehicleClassifier
 class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Turn 64x64 patches into feature vectors, for ``Pipeline`` and ``GridSearchCV``.
 
-    The parameters are the fields of `FeatureParams`, checked by `fit`, and `n_jobs` of `extract_features`.
+    The parameters are the fields of `FeatureParams`, checked by `fit`, and `jobs` of `extract_features`.
     The transformer has no state and works without `fit`. It ignores the gains, which only `train_classifier`
     uses. It passes scikit-learn's estimator checks that do not need tables of numbers as input; images have
     four dimensions, and ``n_features_in_`` is not set.
@@ -53,12 +53,12 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     coarse_hog: bool = False
     hist_gain: float = 1.0
     coarse_gain: float = 1.0
-    n_jobs: int | None = None
+    jobs: int | None = None
 
     def to_params(self) -> FeatureParams:
         """Return the parameters as checked `FeatureParams`."""
         arguments = self.get_params(deep=False)
-        del arguments["n_jobs"]
+        del arguments["jobs"]
         return FeatureParams(**arguments)
 
     def fit(self, X: Any, y: Any = None) -> PatchFeatures:
@@ -68,7 +68,7 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
     def transform(self, X: Any) -> NDArray[np.float32]:
         """Extract feature vectors, ``(N, length)`` float32; `X` as in `extract_features`."""
-        return extract_features(X, self.to_params(), n_jobs=self.n_jobs)
+        return extract_features(X, self.to_params(), jobs=self.jobs)
 
     def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:
         """Names of the features: ``spatial0 ... hist0 ... hog0 ...``."""

@@ -215,7 +215,7 @@ class TrialOptions:
         Parameters of the detector on these frames. The search is also timed with `search_params`.
     time_search
         Measure the time of the fast search of a 1280x720 frame on one core.
-    cache, n_jobs
+    cache, jobs
         Folder that keeps features between runs, or a `FeatureCache` of the same patches; and threads of the
         feature extraction.
 
@@ -230,7 +230,7 @@ class TrialOptions:
     region_params: RegionParams = dataclasses.field(default_factory=RegionParams)
     time_search: bool = True
     cache: FeatureCache | str | os.PathLike[str] | None = None
-    n_jobs: int | None = None
+    jobs: int | None = None
 
     def __post_init__(self) -> None:
         if self.cache is not None and not isinstance(self.cache, FeatureCache):
@@ -261,7 +261,7 @@ class TrialEvaluator:
             )
         cache = options.cache
         if not isinstance(cache, FeatureCache):
-            cache = FeatureCache(patch_set.patches, folder=cache, n_jobs=options.n_jobs)
+            cache = FeatureCache(patch_set.patches, folder=cache, jobs=options.jobs)
         elif cache.patches is not patch_set.patches:
             raise InvalidInputError(
                 "cache must be a FeatureCache of the patches of patch_set; make one from patch_set.patches"

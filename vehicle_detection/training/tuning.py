@@ -400,7 +400,7 @@ def compare_classifiers(
     splits: str | Sequence[str] | Mapping[str, Split] = "sequences",
     seeds: Sequence[int] = (0,),
     cache: FeatureCache | str | os.PathLike[str] | None = None,
-    n_jobs: int | None = None,
+    jobs: int | None = None,
     progress: bool = False,
 ) -> DataFrame:
     """Train and evaluate classifiers of scikit-learn on the same features and splits.
@@ -418,7 +418,7 @@ def compare_classifiers(
         The features; the default is ``FeatureParams()``.
     splits, seeds, progress
         As in `compare_configurations`.
-    cache, n_jobs
+    cache, jobs
         As in `TrialOptions`.
 
     Returns
@@ -449,7 +449,7 @@ def compare_classifiers(
         check_type(params, "params", FeatureParams, "pass FeatureParams() or a preset")
     chosen = params or FeatureParams()
     trials = list(make_splits(patch_set, splits, check_seeds(seeds)))
-    evaluator = TrialEvaluator(patch_set, TrialOptions(cache=cache, n_jobs=n_jobs, time_search=False))
+    evaluator = TrialEvaluator(patch_set, TrialOptions(cache=cache, jobs=jobs, time_search=False))
     for _, _, split in trials:
         check_labels(evaluator.labels[split.train], len(split.train))
     X, rows = evaluator.cache.all(chosen), []

@@ -163,7 +163,7 @@ class FoldDetections:
 
 
 def detect_in_source(
-    model: SearchableModel, source: FrameDataset, *, min_score: float = -6.0, n_jobs: int | None = None
+    model: SearchableModel, source: FrameDataset, *, min_score: float = -6.0, jobs: int | None = None
 ) -> list[FoldDetections]:
     """Detect vehicles in all frames of a source, one `FoldDetections` for each of its sets.
 
@@ -175,7 +175,7 @@ def detect_in_source(
         Labelled frames.
     min_score
         Minimum score of a detection: low, so that a precision-recall curve covers all thresholds in use.
-    n_jobs
+    jobs
         Frames searched at the same time; the result does not depend on it.
 
     Raises
@@ -184,7 +184,7 @@ def detect_in_source(
         If an argument is malformed.
     """
     lowest = check_number(min_score, "min_score")
-    with model.open_search(jobs=1) as search, ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
+    with model.open_search(jobs=1) as search, ThreadPoolExecutor(resolve_jobs(jobs)) as pool:
 
         def detect(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Any]:
             return pair[0], search.find(pair[1], None, min_vehicle_score=lowest).vehicles
