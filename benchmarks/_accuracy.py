@@ -6,16 +6,15 @@ import numpy as np
 
 from benchmarks._material import Context, if_real, is_real, patches
 from benchmarks._report import Row, at_least
-from vehicle_detection import (
-    TrainingOptions,
-    load_classifier,
+from vehicle_detection import TrainingOptions, load_classifier, train_classifier
+from vehicle_detection.datasets import (
+    PatchSet,
+    Split,
     split_leakage,
     split_random,
     split_sequences,
     split_sources,
-    train_classifier,
 )
-from vehicle_detection.datasets import PatchSet, Split
 
 SEEDS = range(5)
 

@@ -15,7 +15,8 @@ from benchmarks._material import Context, clip, repeated_clip
 from benchmarks._probe import run_probe
 from benchmarks._report import Row, at_least, at_most
 from benchmarks._timing import median_of, seconds_of
-from vehicle_detection import batch_status, run_batch
+from vehicle_detection import run_batch
+from vehicle_detection.drive import batch_status
 
 FRAMES, TRIPS = 2000, 8
 MEMORY_TRIPS, MEMORY_FRAMES = 20, 50

@@ -8,7 +8,8 @@ from pathlib import Path
 from benchmarks._material import Context, clip
 from benchmarks._report import Row, at_least, at_most
 from benchmarks._timing import median_of, seconds_of
-from vehicle_detection import VehicleDetector, VideoReport, process_video
+from vehicle_detection import VehicleDetector, process_video
+from vehicle_detection.video import VideoReport
 
 ROUNDS = 3
 

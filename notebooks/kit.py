@@ -228,7 +228,7 @@ def zoom(figure: Any, top: float = 0.45, bottom: float = 0.82) -> Any:
     return figure
 
 
-def score_table(scores: Mapping[Any, vd.DetectionScores]) -> pd.DataFrame:
+def score_table(scores: Mapping[Any, vd.evaluation.DetectionScores]) -> pd.DataFrame:
     """Tabulate detection scores, one row per entry."""
     columns = {"F1": "f1", "found": "tp", "missed": "fn", "false": "fp", "mean IoU": "mean_iou"}
     rows = {

@@ -20,10 +20,10 @@ from vehicle_detection import (
     SearchParams,
     VehicleClassifier,
     VehicleDetector,
-    batch_status,
     render_drive,
     render_scene,
 )
+from vehicle_detection.drive import batch_status
 from vehicle_detection.svm import Template
 from vehicle_detection.training import to_pipeline
 

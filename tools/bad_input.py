@@ -1,7 +1,8 @@
 """Call every public function with bad values of every argument: only the library's errors may come back.
 
 The functions are found by introspection: those of `vehicle_detection`, `vehicle_detection.course` and
-`vehicle_detection.notebook`, with the constructors and methods of their classes. A new one is covered as
+`vehicle_detection.notebook` and the public ones of other subpackages, with the constructors and methods of
+their classes. A new one is covered as
 soon as `_Valid` knows valid values for its arguments. ``python -m tools.bad_input`` tries one value of each
 kind for each argument, also of the commands' options; ``--every`` tries all values. The tests try a few
 kinds for each argument. `tools.bad_input_page` writes the outcomes as a page of the documentation.
@@ -13,6 +14,7 @@ import argparse
 import contextlib
 import inspect
 import itertools
+import operator
 import signal
 import sys
 import tempfile
@@ -30,8 +32,12 @@ from typing import Any, Literal
 import numpy as np
 
 import vehicle_detection as vd
+from vehicle_detection.boxes import Platt
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 from vehicle_detection.training import Halving, to_pipeline
+from vehicle_detection.video import VideoReport
+
+from .site_pages import SUBPACKAGE_NAMES
 
 MAX_SECONDS = 60
 """Time limit of one call, which may have to compile kernels."""
@@ -88,22 +94,35 @@ def bad_values(folder: Path) -> dict[str, tuple[Any, ...]]:
 def public_callables() -> dict[str, Callable[..., Any]]:
     """Return the public functions, the constructors of public classes and their methods, by name."""
     found: dict[str, Callable[..., Any]] = {}
-    for module in (vd, vd.course, vd.notebook):
-        prefix = "" if module is vd else module.__name__.rpartition(".")[2] + "."
-        for name in module.__all__:
-            value = getattr(module, name)
-            if inspect.ismodule(value) or (inspect.isclass(value) and issubclass(value, Exception)):
-                continue
-            if not value.__module__.startswith(vd.__name__):  # of another library, as in `vd.course`
-                continue
-            if prefix and value is getattr(vd, name, None):  # public in the package, too
-                continue
-            if prefix + name not in RESULTS:
-                found[prefix + name] = value
-            if inspect.isclass(value):
-                found.update((f"{prefix}{name}.{each}", method) for each, method in _methods(value))
+    modules = {"course.": vd.course.__all__, "notebook.": vd.notebook.__all__}
+    listed = [("", name, value) for name, value in package_names().items()]
+    listed += [
+        (prefix, name, getattr(getattr(vd, prefix[:-1]), name))
+        for prefix in modules
+        for name in modules[prefix]
+    ]
+    for prefix, name, value in listed:
+        if inspect.ismodule(value) or (inspect.isclass(value) and issubclass(value, Exception)):
+            continue
+        if not value.__module__.startswith(vd.__name__):  # of another library, as in `vd.course`
+            continue
+        if prefix and value is getattr(vd, name, None):  # public in the package, too
+            continue
+        if prefix + name not in RESULTS:
+            found[prefix + name] = value
+        if inspect.isclass(value):
+            found.update((f"{prefix}{name}.{each}", method) for each, method in _methods(value))
     called = {name: value for name, value in found.items() if name not in NOT_CALLED}
     return {name: value for name, value in called.items() if _parameters(value)}
+
+
+def package_names() -> dict[str, Any]:
+    """Return the public names of the package and of its subpackages without a page of their own."""
+    places = {
+        name: f"{module}.{name}" for module, names in SUBPACKAGE_NAMES.items() for name in names.split()
+    }
+    places |= {name: name for name in vd.__all__}
+    return {name: operator.attrgetter(place)(vd) for name, place in places.items()}
 
 
 def _methods(kind: type) -> Iterator[tuple[str, Callable[..., Any]]]:
@@ -111,7 +130,7 @@ def _methods(kind: type) -> Iterator[tuple[str, Callable[..., Any]]]:
     for name, member in inspect.getmembers(kind):
         if name.startswith("_") or not inspect.isroutine(member):
             continue
-        public_bases = [base for base in kind.__mro__[1:] if base.__name__ in vd.__all__]
+        public_bases = [base for base in kind.__mro__[1:] if base.__name__ in package_names()]
         inherited = name not in vars(kind) and any(hasattr(base, name) for base in public_bases)
         own = str(getattr(member, "__module__", "")).startswith("vehicle_detection")
         if own and not inherited and _parameters(member):
@@ -204,8 +223,8 @@ class _Valid:
         search = vd.SearchParams(bands=(band,))
         detector = vd.VehicleDetector(classifier, jobs=1)
         result = detector.process(image)
-        tracker, log, own_speed = vd.Tracker(), vd.TrackTable(), vd.OwnSpeed.constant(25.0)
-        report = vd.VideoReport(
+        tracker, log, own_speed = vd.Tracker(), vd.TrackTable(), vd.drive.OwnSpeed.constant(25.0)
+        report = VideoReport(
             frames=1, fps=Fraction(25), shape=image.shape, seconds=1.0, stages={"search": 1.0}, tracks=0
         )
         clip = folder / "valid.mp4"
@@ -219,7 +238,7 @@ class _Valid:
         _, scaler, svc = (step for _, step in to_pipeline(classifier).steps)
         moving = moviepy.VideoClip(lambda time: image, duration=0.1)
         theirs = SimpleNamespace(xyxy=boxes, confidence=scores, class_id=None)
-        quick = vd.TrialOptions(time_search=False, jobs=1)
+        quick = vd.training.TrialOptions(time_search=False, jobs=1)
         table = _table()
         write_results(table, folder / "results.csv")
         lesson_only = {"spatial_feat": False, "hist_feat": False, "hog_channel": 0, "color_space": "YCrCb"}
@@ -233,11 +252,11 @@ class _Valid:
             "TrackTable": predicted, "FunctionParams": vd.FunctionParams(), "HeatHistory": vd.HeatHistory(),
             "FrameSource": vd.open_source(clip), "HeatmapDetector": vd.HeatmapDetector(classifier),
             "NetworkModel": vd.load_model("default"), "NetworkParams": vd.NetworkParams(),
-            "OwnSpeed": own_speed, "PatchFeatures": vd.PatchFeatures(jobs=1), "PatchSet": patch_set,
-            "Platt": vd.Platt(-1.0, 0.0),
+            "OwnSpeed": own_speed, "PatchFeatures": vd.training.PatchFeatures(jobs=1), "PatchSet": patch_set,
+            "Platt": Platt(-1.0, 0.0),
             "ReportWriter": vd.ReportWriter(folder / "writer.html"),
             "SearchParams": search,
-            "RegionParams": vd.RegionParams(), "SceneCuts": vd.SceneCuts(), "Tracker": tracker,
+            "RegionParams": vd.RegionParams(), "SceneCuts": vd.tracking.SceneCuts(), "Tracker": tracker,
             "VehicleClassifier": classifier, "VehicleDetector": detector,
         }  # fmt: skip
         self.by_name: dict[str, Any] = {
@@ -260,7 +279,7 @@ class _Valid:
             "parameter": "orient", "methods": {"a": [windows]}, "curves": (scores, scores, scores),
             "runs": {"a": [result]}, "out": folder / "out", "target": folder / "out.mp4",
             "pipeline": to_pipeline(classifier), "lateral_px": 10.0, "index": 0, "imgs": [image],
-            "split": vd.Split(np.arange(10), np.arange(10, 20)), "number": 1, "speed": own_speed,
+            "split": vd.datasets.Split(np.arange(10), np.arange(10, 20)), "number": 1, "speed": own_speed,
             "speed_mps": 25.0,
         }  # fmt: skip
         self.by_function: dict[str, dict[str, Any]] = {

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import operator
 import os
 import re
 import subprocess
@@ -48,7 +49,28 @@ API_PAGES = (
     ("datasets", "Data sets and rendered scenes", "datasets scenes"),
     ("errors", "Errors", "errors"),
 )
-API_MODULES = ("notebook", "course")  # public names that are modules; each has a page
+SUBPACKAGE_NAMES = {
+    "boxes": "Platt",
+    "datasets": (
+        "find_near_duplicates Split split_groups split_leakage split_random split_sequences split_sources"
+    ),
+    "drive": (
+        "batch_status batch_summary BatchReport BatchStatus cut_clips Event find_trips open_dask "
+        "OwnSpeed Trip VehicleCounts"
+    ),
+    "evaluation": (
+        "calibrate_scores calibration_error DetectionScores Explanation precision_recall_curve TrackScores"
+    ),
+    "search": "SearchResult",
+    "tracking": "HorizonEstimate SceneCuts",
+    "training": (
+        "compare_classifiers compare_configurations FrameDataset mine_negatives pareto_front "
+        "PatchFeatures read_results search_parameters TrainingReport TrialOptions"
+    ),
+    "video": "FrameSource TrackRun VideoReport",
+}
+"""Public names that are attributes of a subpackage or module, and not of the package."""
+API_MODULES = ("notebook", "course")  # modules that have a page of their own
 
 _LINK = re.compile(r"""(?P<start>\]\(|src=\\?")(?P<path>[^)"\\#\s:]+)(?P<end>#[^)"\\\s]*)?(?=[)"\\])""")
 
@@ -99,10 +121,13 @@ def read_section(text: str, title: str) -> str:
 
 
 def public_names() -> dict[str, list[str]]:
-    """Return the public names by the module of the package that defines them, read from ``__init__.pyi``."""
+    """Return the public names by the module that defines them: ``__init__.pyi`` and `SUBPACKAGE_NAMES`."""
     tree = ast.parse((ROOT / "vehicle_detection/__init__.pyi").read_text())
     imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
-    return {node.module or "": [alias.name for alias in node.names] for node in imports}
+    names = {node.module or "": [alias.name for alias in node.names] for node in imports}
+    for module, others in SUBPACKAGE_NAMES.items():
+        names[module] = [*names[module], *(f"{module}.{name}" for name in others.split())]
+    return names
 
 
 def api_pages() -> dict[str, str]:
@@ -123,7 +148,7 @@ def api_pages() -> dict[str, str]:
     pages = {}
     for page, title, modules in API_PAGES:
         found = sorted((name for module in modules.split() for name in names.pop(module)), key=str.lower)
-        table = [".. autosummary::", "", *(f"   {name}" for name in found), ""]
+        table = [".. autosummary::", "", *(f"   {_place(name)}" for name in found), ""]
         pages[f"{page}.rst"] = "\n".join(
             [*_heading(title), ".. currentmodule:: vehicle_detection", "", *table, *map(_directive, found)]
         )
@@ -131,7 +156,7 @@ def api_pages() -> dict[str, str]:
         directive = [f".. automodule:: vehicle_detection.{name}", "   :members:"]
         directive += [f"   :exclude-members: {', '.join(described[name])}"] * bool(described[name])
         pages[f"{name}.rst"] = "\n".join([*_heading(f"vehicle_detection.{name}"), *directive, ""])
-    missing = [name for rest in names.values() for name in rest if name not in API_MODULES]
+    missing = [name for module, rest in names.items() if module for name in rest]
     if missing:
         raise ValueError(f"public names without a page: {', '.join(missing)}; add their modules to API_PAGES")
     toctree = [".. toctree::", "   :maxdepth: 2", "", *(f"   {Path(page).stem}" for page in pages), ""]
@@ -140,8 +165,8 @@ def api_pages() -> dict[str, str]:
 
 
 _API_INTRODUCTION = """\
-Every public name is an attribute of the package: ``import vehicle_detection as vd``, then
-``vd.VehicleDetector``.
+Names are attributes of the package or of a subpackage: ``import vehicle_detection as vd``, then
+``vd.VehicleDetector`` and ``vd.training.mine_negatives``.
 Images are ``(H, W, 3)`` uint8 RGB, boxes ``[x1, y1, x2, y2]`` in half-open pixels.
 """
 
@@ -159,12 +184,17 @@ def _heading(title: str) -> list[str]:
     return [title, "=" * len(title), ""]
 
 
+def _place(name: str) -> str:
+    """Return a name as Sphinx takes it in the module `vehicle_detection`: complete if it has a dot."""
+    return f"vehicle_detection.{name}" if "." in name else name
+
+
 def _directive(name: str) -> str:
-    value = getattr(vehicle_detection, name)
+    value = operator.attrgetter(name)(vehicle_detection)
     if not inspect.isclass(value):
-        return f".. autofunction:: {name}\n"
+        return f".. autofunction:: {_place(name)}\n"
     kind = "autoexception" if issubclass(value, BaseException) else "autoclass"
-    return f".. {kind}:: {name}\n   :members:\n"
+    return f".. {kind}:: {_place(name)}\n   :members:\n"
 
 
 def command_page() -> str:

@@ -226,7 +226,8 @@ class VehicleClassifier:
         >>> from sklearn.pipeline import make_pipeline
         >>> from sklearn.preprocessing import MinMaxScaler
         >>> from sklearn.linear_model import RidgeClassifier
-        >>> from vehicle_detection import PatchFeatures, render_patches
+        >>> from vehicle_detection import render_patches
+        >>> from vehicle_detection.training import PatchFeatures
         >>> patches, labels = render_patches(20)
         >>> pipeline = make_pipeline(PatchFeatures(orient=6), MinMaxScaler(), RidgeClassifier())
         >>> VehicleClassifier.from_pipeline(pipeline.fit(patches, labels)).score(patches, labels)

@@ -17,9 +17,10 @@ from typer.testing import CliRunner
 from tests.drive.batch_helpers import check_whole, counts, files, records, run
 from tests.helpers import write_network
 from tests.video.clips import damage_sizes
-from vehicle_detection import batch_status, batch_summary, process_video, run_batch
+from vehicle_detection import process_video, run_batch
 from vehicle_detection.cli.app import app
 from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.drive import batch_status, batch_summary
 from vehicle_detection.drive import batch_store as store
 from vehicle_detection.drive import batch_trip as trip_module
 from vehicle_detection.drive.batch_plan import list_videos, source_id

@@ -19,7 +19,8 @@ from tests.drive.batch_helpers import check_whole, counts, files, records, unfin
 from tests.drive.conftest import TRIPS
 from tests.helpers import ROOT
 from tests.video.clips import child_processes
-from vehicle_detection import batch_status, open_dask, run_batch
+from vehicle_detection import run_batch
+from vehicle_detection.drive import batch_status, open_dask
 from vehicle_detection.errors import InvalidInputError
 
 pytestmark = pytest.mark.usefixtures("private_scratch")

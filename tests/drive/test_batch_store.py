@@ -11,8 +11,8 @@ import pytest
 
 from tests.drive.batch_helpers import check_whole, counts, run
 from tests.drive.object_store import PORT, SITE, ObjectStore
-from vehicle_detection import batch_status
 from vehicle_detection.drive import batch_plan as plan
+from vehicle_detection.drive import batch_status
 from vehicle_detection.drive.batch_plan import list_videos
 from vehicle_detection.drive.batch_store import open_store
 from vehicle_detection.errors import InvalidInputError, OutputError, TransientVideoError

@@ -5,7 +5,8 @@ import dataclasses
 import pytest
 
 from tests.drive.report_helpers import track
-from vehicle_detection import Event, TrackTable, count_vehicles
+from vehicle_detection import TrackTable, count_vehicles
+from vehicle_detection.drive import Event
 from vehicle_detection.errors import InvalidInputError
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.video.clips import write_clip
-from vehicle_detection import Event, cut_clips, probe_video, write_events
-from vehicle_detection.drive import EVENT_COLUMNS
+from vehicle_detection import probe_video, write_events
+from vehicle_detection.drive import EVENT_COLUMNS, Event, cut_clips
 from vehicle_detection.errors import InvalidInputError
 
 EVENTS = [

@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.drives import CAMERA, FPS, SHAPE, cut_in_times, log_frames, passing_times, simulate
-from vehicle_detection import Camera, Event, TrackTable, find_events
+from vehicle_detection import Camera, TrackTable, find_events
 from vehicle_detection._common import UNITS
+from vehicle_detection.drive import Event
 from vehicle_detection.drive.history import track_histories
 from vehicle_detection.drive.motion import estimate_motion
 from vehicle_detection.errors import InvalidInputError

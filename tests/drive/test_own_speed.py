@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_detection import InvalidInputError, OwnSpeed, read_own_speed
+from vehicle_detection import InvalidInputError, read_own_speed
+from vehicle_detection.drive import OwnSpeed
 
 POINT = '<trkpt lat="{lat}" lon="{lon}"><ele>5</ele><time>{time}</time>{speed}</trkpt>'
 GPX = (

@@ -9,7 +9,8 @@ import pytest
 
 from tests.drawing.cases import track
 from tests.video.clips import write_clip
-from vehicle_detection import Event, InvalidInputError, OwnSpeed, TrackTable, write_subtitles
+from vehicle_detection import InvalidInputError, TrackTable, write_subtitles
+from vehicle_detection.drive import Event, OwnSpeed
 from vehicle_detection.video.ffmpeg import ffmpeg_binary
 
 EVENT = Event(

@@ -15,8 +15,7 @@ import pytest
 
 from tests.helpers import ROOT
 from tests.video.clips import child_processes
-from vehicle_detection import open_dask
-from vehicle_detection.drive import worker_pool
+from vehicle_detection.drive import open_dask, worker_pool
 from vehicle_detection.drive.worker_pool import WorkerLost, WorkerPool
 
 pytestmark = pytest.mark.usefixtures("private_scratch")

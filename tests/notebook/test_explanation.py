@@ -5,7 +5,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from tests.notebook.helpers import gray_image, titles
-from vehicle_detection import Explanation
+from vehicle_detection.evaluation import Explanation
 from vehicle_detection.notebook import plot_explanation
 
 CELLS = np.array([[0.5, -1.0, 0.0], [0.25, 0.0, 1.0]])

@@ -88,7 +88,8 @@ def count_vehicles(events: Iterable[Event], table: TrackTable, *, fps: float) ->
 
     Examples
     --------
-    >>> from vehicle_detection import Event, TrackTable
+    >>> from vehicle_detection import TrackTable
+    >>> from vehicle_detection.drive import Event
     >>> table = TrackTable()
     >>> for frame in range(3000):
     ...     table.append(frame)

@@ -44,7 +44,7 @@ def write_events(events: Iterable[Event], path: str | os.PathLike[str]) -> int:
     Examples
     --------
     >>> import tempfile
-    >>> from vehicle_detection import Event
+    >>> from vehicle_detection.drive import Event
     >>> file = Path(tempfile.mkdtemp()) / "events.csv"
     >>> event = Event(kind="met", track_id=3, frame=50, start_frame=40, end_frame=52, time_s=2.0)
     >>> write_events([event], file)

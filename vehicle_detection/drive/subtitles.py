@@ -104,7 +104,8 @@ def write_subtitles(
     --------
     >>> import tempfile
     >>> from pathlib import Path
-    >>> from vehicle_detection import OwnSpeed, TrackTable
+    >>> from vehicle_detection import TrackTable
+    >>> from vehicle_detection.drive import OwnSpeed
     >>> table = TrackTable()
     >>> for frame in range(50):
     ...     table.append(frame, frame / 25)
