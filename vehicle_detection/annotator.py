@@ -384,9 +384,8 @@ class Annotator:
         blur: Literal["vehicles", "plates"] | None = None,
         diagnostics: bool = False,
     ) -> None:
-        for name, value, kind in (("style", style, DrawParams), ("heat", heat, HeatParams)):
-            if value is not None:
-                check_type(value, name, kind, "omit it for the default")
+        check_type(style, "style", DrawParams | None, "omit it for the default")
+        check_type(heat, "heat", HeatParams | None, "omit it for the default")
         if own_speed is not None and not callable(getattr(own_speed, "at", None)):
             got = describe(own_speed)
             raise InvalidInputError(f"own_speed must have a method at, got {got}; pass read_own_speed(...)")

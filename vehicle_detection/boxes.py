@@ -1,8 +1,7 @@
 """Boxes of vehicles: their arithmetic, suppression of overlapping ones, and their scores.
 
-Boxes are ``(N, 4)`` arrays ``[x1, y1, x2, y2]`` in half-open pixels: the width is ``x2 - x1``. `Detections`
-are boxes with scores; `Platt` turns scores into probabilities, and `log_odds` the scores of other detectors
-into those of this library. Functions without ``check_`` in their body are for arrays that were checked.
+Boxes are ``(N, 4)`` arrays ``[x1, y1, x2, y2]`` in half-open pixels: the width is ``x2 - x1``. Functions
+without ``check_`` in their body are for arrays that were checked.
 """
 
 from __future__ import annotations
@@ -59,11 +58,6 @@ class Detections:
         ``(N,)`` calibrated probabilities of a vehicle in [0, 1]; None if they are unknown. A column of NaN,
         as in a table, becomes None.
 
-    Raises
-    ------
-    InvalidInputError
-        If the columns differ in length or contain NaN, or a confidence is not a probability.
-
     Examples
     --------
     >>> found = Detections([[0, 0, 10, 10], [5, 5, 9, 9]], [0.5, 2.0])
@@ -86,23 +80,18 @@ class Detections:
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        boxes = check_boxes(self.boxes)
+        boxes, confidences = check_boxes(self.boxes), self.confidences
         scores = _score_column(self.scores, "scores", len(boxes))
-        object.__setattr__(self, "boxes", boxes)
-        object.__setattr__(self, "scores", scores)
-        if self.confidences is None:
-            return
-        given = check_array(self.confidences, "confidences")
-        if given.size and given.dtype.kind == "f" and np.isnan(given).all():
-            object.__setattr__(self, "confidences", None)
-            return
-        confidences = _score_column(given, "confidences", len(boxes))
-        if not ((confidences >= 0) & (confidences <= 1)).all():
+        if confidences is not None:
+            given = check_array(confidences, "confidences")
+            unknown = given.size and given.dtype.kind == "f" and np.isnan(given).all()
+            confidences = None if unknown else _score_column(given, "confidences", len(boxes))
+        if confidences is not None and not ((confidences >= 0) & (confidences <= 1)).all():
             raise InvalidInputError(
                 f"confidences must be probabilities, 0 to 1, got {describe(self.confidences)}; omit them "
                 "where they are unknown"
             )
-        object.__setattr__(self, "confidences", confidences)
+        vars(self).update(boxes=boxes, scores=scores, confidences=confidences)
 
     @classmethod
     def from_columns(
@@ -132,23 +121,13 @@ class Detections:
         Parameters
         ----------
         detections
-            An object with ``xyxy``, ``(N, 4)``, with ``confidence`` or ``conf``, ``(N,)`` or None if unknown,
-            and, if known, with ``class_id`` or ``cls``, ``(N,)``. The second names are those of the ``boxes``
-            of Ultralytics' results.
+            An object with ``xyxy``, ``(N, 4)``, with ``confidence`` or ``conf``, ``(N,)`` or None if unknown
+            (the score is then 3), and, if known, with ``class_id`` or ``cls``, ``(N,)``. The second names are
+            those of the ``boxes`` of Ultralytics' results.
         score, threshold
-            What the confidences are, as in `detector_from`.
+            What the confidences are, as in `detector_from`; they become log-odds above the threshold.
         class_ids
             Keep only boxes of these classes, such as ``(2, 5, 7)`` for the cars, buses and trucks of COCO.
-
-        Returns
-        -------
-        Detections
-            Boxes with scores in log-odds above the threshold. If confidences are unknown, the score is 3.
-
-        Raises
-        ------
-        InvalidInputError
-            If an attribute is missing, a column is malformed, or classes are asked for but unknown.
 
         Examples
         --------
@@ -165,11 +144,8 @@ class Detections:
             )
         scale = check_score_scale(score, threshold)
         boxes, confidence = check_boxes(detections.xyxy), _first_known(detections, "confidence", "conf")
-        if confidence is None:
-            scores = np.full(len(boxes), _CERTAIN_SCORE)
-        else:
-            scores = log_odds(confidence, scale, threshold)
-        found = cls(boxes, scores)
+        certain = np.full(len(boxes), _CERTAIN_SCORE)
+        found = cls(boxes, certain if confidence is None else log_odds(confidence, scale, threshold))
         if class_ids is None:
             return found
         return select_classes(found, _first_known(detections, "class_id", "cls"), check_class_ids(class_ids))
@@ -192,7 +168,7 @@ class Detections:
 
         The confidence is that of the detection or, if unknown, ``1 / (1 + exp(-score))``: a score of 0, the
         threshold of a vehicle, becomes 0.5. The class is 0. `tracker_id` are ``(N,)`` numbers of the tracks,
-        if known. Raises `InvalidInputError` if supervision is not installed.
+        if known.
         """
         try:
             from supervision import Detections as SupervisionDetections
@@ -327,22 +303,9 @@ def on_one_vehicle(boxes: Floats) -> NDArray[np.bool_]:
 
 
 def iou_matrix(first: Detections | ArrayLike, second: Detections | ArrayLike) -> Floats:
-    """Intersection over union of each box of `first` with each box of `second`.
+    """Intersection over union of ``(N, 4)`` with ``(M, 4)`` boxes: ``(N, M)`` float64 in [0, 1].
 
-    Parameters
-    ----------
-    first, second
-        ``(N, 4)`` and ``(M, 4)`` boxes ``[x1, y1, x2, y2]``.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(N, M)`` float64 in [0, 1]. The IoU of a box without area is 0, even with itself.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is not an array of finite boxes with ``x1 <= x2`` and ``y1 <= y2``.
+    The IoU of a box without area is 0, even with itself.
 
     Examples
     --------
@@ -355,22 +318,9 @@ def iou_matrix(first: Detections | ArrayLike, second: Detections | ArrayLike) ->
 
 
 def clip_boxes(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Clip boxes to an image of `shape`; a box outside the image collapses onto its border.
+    """Clip ``(N, 4)`` boxes to an image of ``(height, width, ...)``: a new array of the same dtype.
 
-    Parameters
-    ----------
-    boxes, shape
-        ``(N, 4)`` boxes, and ``(height, width, ...)`` of the image.
-
-    Returns
-    -------
-    numpy.ndarray
-        A new ``(N, 4)`` array of the same dtype.
-
-    Raises
-    ------
-    InvalidInputError
-        If the boxes are malformed or `shape` is not the shape of an image.
+    A box outside the image collapses onto its border.
 
     Examples
     --------
@@ -437,11 +387,6 @@ def non_max_suppression(
     numpy.ndarray
         Indices of the kept boxes, best score first; equal scores keep their order.
 
-    Raises
-    ------
-    InvalidInputError
-        If boxes and scores differ in number or contain NaN.
-
     Examples
     --------
     >>> non_max_suppression([[0, 0, 10, 10], [1, 0, 11, 10], [50, 0, 60, 10]], [0.5, 0.9, 0.1])
@@ -499,20 +444,10 @@ def check_score_scale(score: object, threshold: float | None) -> ScoreScale:
 
 @dataclass(frozen=True)
 class Platt(Checked):
-    """The sigmoid that turns scores into probabilities, as `calibrate_scores` fits it.
+    """The sigmoid ``1 / (1 + exp(a * score + b))`` of a score's probability, as `calibrate_scores` fits it.
 
-    Attributes
-    ----------
-    a, b
-        Of ``1 / (1 + exp(a * score + b))``; `a` is negative where higher scores are vehicles.
+    `a` is negative where higher scores are vehicles.
 
-    Raises
-    ------
-    InvalidInputError
-        If a number is not finite.
-
-    Examples
-    --------
     >>> platt = Platt(-2.0, 1.0)
     >>> platt.probability([0.0, 2.0]).round(2), platt.score(0.5)
     (array([0.27, 0.95]), 0.5)

@@ -5,8 +5,6 @@ road, as in Stein, Mano and Shashua, *Vision-based ACC with a single camera* (IV
 pixels below the horizon lies ``focal * height / d`` ahead, and a vehicle of known width seen `w` pixels wide
 lies ``focal * width / w`` ahead. Boxes from a fisheye lens are first converted to those of a pinhole camera
 with the model of OpenCV's ``cv2.fisheye`` (Kannala and Brandt, PAMI 2006).
-
-`Camera` is what is known before a video; `tracking.horizon` refines its horizon from the vehicles.
 """
 
 from __future__ import annotations
@@ -88,10 +86,8 @@ class Camera(Checked):
         estimates the row from the vehicles it tracks, with this prior.
     height_m
         Height of the lens above the road.
-    vehicle_width_m, vehicle_width_std_m
-        Mean width of vehicles and its standard deviation.
-    vehicle_height_m
-        Mean height of vehicles.
+    vehicle_width_m, vehicle_width_std_m, vehicle_height_m
+        Mean width of vehicles, its standard deviation, and their mean height.
     vehicle_length_m, vehicle_length_std_m
         Mean length of the visible side of vehicles in other lanes, and its standard deviation.
     bottom_std_px, pitch_std_px
@@ -148,7 +144,7 @@ class Camera(Checked):
         lens: str | None = None,
         **known: Any,
     ) -> Camera:
-        """Return a typical dash-cam for frames of this shape; pass what is known better by name.
+        """Return a typical dash-cam, in pixels of frames of this shape; pass what is known better by name.
 
         Parameters
         ----------
@@ -163,18 +159,8 @@ class Camera(Checked):
             Name of a typical lens, which replaces `fov`: ``"standard-58"`` or ``"wide-90"``
             (pinhole), ``"fisheye-120"``, ``"fisheye-140"`` or ``"fisheye-170"`` (``focal_px * angle``).
         **known
-            Other attributes of the class, such as ``focal_std=0.01`` for a calibrated lens.
-
-        Returns
-        -------
-        Camera
-            In pixels of frames of this shape.
-
-        Raises
-        ------
-        InvalidInputError
-            If an argument is unknown or out of range, or `k1` and `k2` make the radius at the edge of the
-            field of view negative or 0.
+            Other attributes of the class, such as ``focal_std=0.01`` for a calibrated lens. `k1` and `k2`
+            must keep the radius positive up to the edge of the field of view.
         """
         height, width = check_shape(shape)
         horizon = check_number(horizon, "horizon", low=-10, high=10)
@@ -215,13 +201,10 @@ class Camera(Checked):
         Parameters
         ----------
         fov, lens
-            Angle of view along the frame's longer side in degrees, of a lens without distortion; or the name
-            of a typical lens, as in `for_frame`. If both are unknown, 58 degrees with an error of 25%.
-        height_m
-            Height of the lens above the road in meters; by default 1.3.
-        horizon
-            Row of the horizon as a fraction of the height, 0 at the top; by default in the middle, and
-            estimated by the tracker.
+            As in `for_frame`; a `fov` is that of a lens without distortion. If both are unknown, 58 degrees
+            with an error of 25%.
+        height_m, horizon
+            As in `for_frame`; by default 1.3, and in the middle, from where the tracker estimates it.
 
         Examples
         --------
@@ -238,11 +221,9 @@ class Camera(Checked):
             height = check_number(height_m, "height_m", above=0, high=100)
             known |= {"height_m": height, "height_std_m": _GIVEN_HEIGHT_STD}
         camera = dataclasses.replace(cls.for_frame(_REFERENCE_SHAPE, **known), shape=None)
-        return (
-            camera.with_horizon(horizon)
-            if horizon is not None
-            else camera.with_horizon(_HORIZON, _HORIZON_STD)
-        )
+        if horizon is None:
+            return camera.with_horizon(_HORIZON, _HORIZON_STD)
+        return camera.with_horizon(horizon)
 
     def with_horizon(self, horizon: float, std: float = _GIVEN_HORIZON_STD) -> Camera:
         """Return the camera with another horizon and standard error, as fractions of the frame's height."""
@@ -255,13 +236,8 @@ class Camera(Checked):
     def for_shape(self, shape: tuple[int, ...]) -> Camera:
         """Return the camera in pixels of frames of ``(height, width, ...)``, another size of the same video.
 
-        Raises
-        ------
-        InvalidInputError
-            If the aspect ratio is not that of the camera's own shape.
+        An `InvalidInputError` is raised if the aspect ratio is not that of the camera's own shape.
 
-        Examples
-        --------
         >>> round(Camera.for_frame((720, 1280)).for_shape((360, 640)).horizon_px, 1)
         201.6
         """
@@ -323,30 +299,12 @@ class Camera(Checked):
         return np.asarray(self.focal_px * self.vehicle_width_m + self.vehicle_length_m * lateral)
 
     def rectify_boxes(self, boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
-        """Convert boxes to those of a pinhole camera with the same focal length.
+        """Convert boxes to those of a pinhole camera with the same focal length and middle.
 
         The middles of a box's edges are converted, and points farther than 80 degrees from the optical axis
-        are moved there.
+        are moved there. `boxes` are ``(N, 4)`` in pixels of frames of `shape`; a pinhole camera returns them
+        unchanged.
 
-        Parameters
-        ----------
-        boxes
-            ``(N, 4)`` boxes ``[x1, y1, x2, y2]`` in pixels of the frame; or `Detections`.
-        shape
-            ``(height, width, ...)`` of the frame.
-
-        Returns
-        -------
-        numpy.ndarray
-            ``(N, 4)`` boxes around the same middle of the frame; for a pinhole camera `boxes` as they are.
-
-        Raises
-        ------
-        InvalidInputError
-            If the boxes are malformed, or the camera was made for frames of another aspect ratio.
-
-        Examples
-        --------
         >>> camera = Camera.for_frame((720, 1280), lens="fisheye-120")
         >>> camera.rectify_boxes(np.array([[900.0, 400, 1100, 520]]), (720, 1280)).round()
         array([[ 920.,  405., 1219.,  547.]])
@@ -409,11 +367,6 @@ def open_camera(
         As in `Camera.dashcam`; `fov` for an unknown lens, `height_m` also for a named one. `horizon` replaces
         that of the camera.
 
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, or states what the camera contains.
-
     Examples
     --------
     >>> open_camera("wide-90", horizon=0.55).horizon_px
@@ -447,11 +400,6 @@ def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int,
     shape
         ``(height, width, ...)`` of the frames to which its pixels are scaled; by default its own shape.
 
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, or the folder is missing or read-only.
-
     Examples
     --------
     >>> import tempfile
@@ -468,7 +416,7 @@ def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int,
 
 
 def read_camera(path: str | os.PathLike[str]) -> Camera:
-    """Read a camera from a JSON file.
+    """Read a camera from a JSON file, for frames of the aspect ratio of its ``image_size``, or of any.
 
     Parameters
     ----------
@@ -476,18 +424,8 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
         A file of `write_camera`, or one written by hand. It is an object with attributes of `Camera`, all of
         them optional. Instead of ``focal_px`` it may hold ``fov`` (degrees along the longer side) or ``lens``
         (as in `Camera.for_frame`), and instead of ``horizon_px`` ``horizon`` (a fraction of the height). With
-        pixels it needs ``image_size``, ``[width, height]``.
-
-    Returns
-    -------
-    Camera
-        For frames of the aspect ratio of ``image_size``, or of any. A lens or horizon that the file lacks has
-        a large standard error.
-
-    Raises
-    ------
-    InvalidInputError
-        If the file is missing or malformed.
+        pixels it needs ``image_size``, ``[width, height]``. A lens or horizon that it lacks gets a large
+        standard error.
 
     Examples
     --------
@@ -507,10 +445,9 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
     if pixels and size is None:
         raise InvalidInputError(f"{path}: {pixels[0]} needs image_size, [width, height] in pixels; add it")
     try:
-        given = (
-            None if size is None else [check_integer(side, "image_size", low=1) for side in reversed(size)]
-        )
-        shape = _REFERENCE_SHAPE if given is None else (given[0], given[1])
+        shape = _REFERENCE_SHAPE
+        if size is not None:
+            shape = check_integer(size[1], "image_size", low=1), check_integer(size[0], "image_size", low=1)
         if "horizon" not in values and "horizon_px" not in values:
             values = {"horizon": _HORIZON, "horizon_std_px": _HORIZON_STD * shape[0]} | values
         if "focal_px" not in values and "lens" not in values:

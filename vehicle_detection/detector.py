@@ -77,22 +77,15 @@ def load_model(
         ``"default"``, a network for any road; ``"highway"``, the course's classifier of patches; an ``.onnx``
         file, of this library or of another detector; or a ``.safetensors`` file.
     classes
-        Names or numbers of the classes of a network that are vehicles. Default: car, truck, bus, van and
+        Names or numbers of the classes of a network that are vehicles, by default car, truck, bus, van,
         vehicle.
     device
         Where a network runs: ``"cpu"``, or ``"cuda"`` with the package onnxruntime-gpu.
-
-    Returns
-    -------
-    NetworkModel or VehicleClassifier
-        A network for ``"default"`` and ``.onnx`` files; otherwise a classifier.
 
     Raises
     ------
     ModelFileError
         If the file is missing, truncated, edited, of another version, or does not fit its own parameters.
-    InvalidInputError
-        If `path` is neither a path nor a name, or `classes` or `device` do not fit the model.
 
     Examples
     --------
@@ -144,19 +137,17 @@ class Detector(Closing):
         A name (``"default"`` for any road, ``"highway"``), the path of a model file, such as
         ``"own.safetensors"`` or the ``"yolo11n.onnx"`` of another library, or what `load_model` returns.
     conf
-        Minimum confidence of a vehicle in a single image: its calibrated probability, from 0.001 to 0.999;
-        lower and higher values mean these. Scores are those above this threshold. None: the model's own.
+        Minimum confidence of a vehicle in a single image: its calibrated probability, from 0.001 to 0.999.
+        Scores are those above this threshold. None: the model's own.
     search_params
-        Where to search: `NetworkParams` for a network, `SearchParams` for a classifier of patches,
-        `FunctionParams` for a function. By default the model's, with the horizon of `camera` if it is known.
+        Where to search: `NetworkParams`, `SearchParams` for a classifier of patches, or `FunctionParams`. By
+        default the model's, with the horizon of `camera` if it is known.
     region_params
         How windows become boxes, unless the model predicts boxes: `RegionParams` for one box per group of
-        agreeing windows; `HeatParams` for the course's heat map (any model). Without a threshold in it, the
-        threshold fits the model and its search.
-    camera
-        The camera: a `Camera`, or what `open_camera` accepts.
-    jobs
-        Threads of the search of one image.
+        agreeing windows; `HeatParams` for the course's heat map (any model), by default with a threshold that
+        fits the model and its search.
+    camera, jobs
+        A `Camera`, or what `open_camera` accepts; and threads of the search of one image.
     low_score
         Scores from here on, below 0, are found by `search` for a tracker, which continues tracks with them.
 
@@ -164,8 +155,6 @@ class Detector(Closing):
     ------
     ModelFileError
         If the model file is missing or damaged.
-    InvalidInputError
-        If an argument is malformed, or `search_params` or `conf` do not fit the model.
 
     Warns
     -----
@@ -191,12 +180,9 @@ class Detector(Closing):
         low_score: float = TrackParams.low_threshold,
     ) -> None:
         self.model = _check_model(model)
-        kind = self.model.search_params_type
-        kind = self.model.search_params_type
-        if search_params is not None:
-            check_type(search_params, "search_params", kind, "omit it for the default")
-        if region_params is not None:
-            check_type(region_params, "region_params", (RegionParams, HeatParams), "omit it for the default")
+        kind, remedy = self.model.search_params_type, "omit it for the default"
+        check_type(search_params, "search_params", kind | None, remedy)
+        check_type(region_params, "region_params", RegionParams | HeatParams | None, remedy)
         if conf is not None:
             region_params = self._set_confidence(conf, region_params)
         self.camera = open_camera(camera)
@@ -251,13 +237,7 @@ class Detector(Closing):
         return self.heat_params is not None or self.model.searches_every_frame
 
     def search(self, frame: Image) -> SearchResult:
-        """Search an ``(H, W, 3)`` uint8 RGB image for windows and vehicles.
-
-        Raises
-        ------
-        InvalidInputError
-            If the frame is malformed, or is too small for a window.
-        """
+        """Search an ``(H, W, 3)`` uint8 RGB image, not too small for a window, for windows and vehicles."""
         return self._search.find(frame, self.search_params, min_vehicle_score=self.low_score)
 
     def fit(self, found: SearchResult) -> Detections:
@@ -291,11 +271,6 @@ class Detector(Closing):
         -------
         Detections or list of Detections
             Boxes in pixels of the image, with scores and, unless they come from a heat map, confidences.
-
-        Raises
-        ------
-        InvalidInputError
-            If an image is malformed, unreadable or too small for a window.
         """
         if isinstance(image, list):
             return [self.detect(each) for each in image]
@@ -309,10 +284,7 @@ class Detector(Closing):
 
 
 class _OneThread:
-    """A lock that refuses a second thread, because tracks follow the order of the frames.
-
-    Its copies are locks of their own.
-    """
+    """A lock, not shared by copies, that refuses a second thread: tracks follow the order of the frames."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
@@ -337,19 +309,16 @@ class VehicleDetector(Closing):
     Parameters
     ----------
     model
-        A name (``"default"`` for any road, ``"highway"``), the path of a model file, what `load_model`
-        returns, or a `Detector`, which replaces the arguments `conf` to `region_params` and `jobs`. For a
-        function of your own see `detector_from`.
+        As in `Detector`; or a `Detector`, which replaces the arguments `conf` to `region_params` and `jobs`.
+        For a function of your own see `detector_from`.
     conf, search_params, region_params, jobs
         Arguments of the `Detector`. The heat map of `HeatParams` is the mean over the last frames.
     camera
         The camera, for distances and boxes: a `Camera`, a file of `write_camera`, or the name of a lens, as
         in `Camera.for_frame`. By default a dash-cam, whose horizon is estimated from the vehicles, and whose
         distances have a standard error of at least 25%.
-    track_params
-        Parameters of the tracker.
-    annotator
-        Draws the results: labels, lines, colors, a bird's-eye view, blurred vehicles.
+    track_params, annotator
+        Parameters of the tracker; and what draws labels, lines, colors, a bird's-eye view, blurred vehicles.
 
     Attributes
     ----------
@@ -378,20 +347,11 @@ class VehicleDetector(Closing):
         annotator: Annotator | None = None,
         jobs: int | None = None,
     ) -> None:
-        for name, value, kind in (
-            ("track_params", track_params, TrackParams),
-            ("annotator", annotator, Annotator),
-        ):
-            if value is not None:
-                check_type(value, name, kind, "omit it for the default")
+        check_type(track_params, "track_params", TrackParams | None, "omit it for the default")
+        check_type(annotator, "annotator", Annotator | None, "omit it for the default")
         self.track_params = track_params or TrackParams()
-        options: dict[str, Any] = {
-            "conf": conf,
-            "search_params": search_params,
-            "region_params": region_params,
-            "camera": camera,
-            "jobs": jobs,
-        }
+        options: dict[str, Any] = {"conf": conf, "search_params": search_params, "camera": camera}
+        options |= {"region_params": region_params, "jobs": jobs}
         if not isinstance(model, Detector):
             low_score = min(0.0, self.track_params.low_threshold, self.track_params.high_threshold)
             model = Detector(model, **options, low_score=low_score)
@@ -406,10 +366,7 @@ class VehicleDetector(Closing):
         self.reset()
 
     def reset(self, *, fps: float | None = None) -> None:
-        """Forget all frames, before the first frame of another video.
-
-        `fps` is the frame rate, for frames without a time; if it is unknown, 25 is assumed.
-        """
+        """Forget all frames, before another video; `fps` is for frames without times, 25 if unknown."""
         self._fps = None if fps is None else check_number(fps, "fps", above=0, high=1e6)
         self.tracker = Tracker(
             self.track_params,
@@ -464,11 +421,9 @@ class VehicleDetector(Closing):
 
         Parameters
         ----------
-        frame
-            ``(H, W, 3)`` uint8 RGB.
-        time
-            Time of the frame in seconds; None: one frame after the last one, at the frame rate that `reset`
-            was given (25 per second if none).
+        frame, time
+            ``(H, W, 3)`` uint8 RGB, and its time in seconds, by default one frame after the last one, at the
+            frame rate that `reset` was given (25 per second if none).
         search
             False predicts the tracks instead of searching the frame, to save time, unless it begins a scene.
 
@@ -515,11 +470,6 @@ class VehicleDetector(Closing):
             Number of frames since the last one, of which the others were not searched.
         cut
             Whether the frame begins another scene (`tracking.SceneCuts`), which ends all tracks.
-
-        Raises
-        ------
-        InvalidInputError
-            If an argument is malformed, or another thread is processing a frame.
         """
         check_type(found, "found", SearchResult, "pass what search returns")
         with self._one_thread:
@@ -563,9 +513,8 @@ class VehicleDetector(Closing):
     def __call__(self, frame: Image | Path) -> Image:
         """Return the next frame annotated; for the path of an image file, that image with its vehicles.
 
-        In moviepy use `annotate_clip`. With ``clip.image_transform(detector)`` only images arrive here: times
-        are those of the frame rate that `reset` was given (25 if none), and a second clip continues the
-        tracks of the first one. The first frame, which moviepy reads twice, counts once.
+        In moviepy use `annotate_clip`: ``clip.image_transform(detector)`` knows no times, and a second clip
+        continues the tracks of the first one. The first frame, which moviepy reads twice, counts once.
         """
         if isinstance(frame, (str, os.PathLike)):
             image, blur = read_image(frame), self.annotator.blur

@@ -37,13 +37,8 @@ DetectorFunction = Callable[[NDArray[np.uint8]], Any]
 class FunctionParams(Checked):
     """Parameters of a detector that is a function: it searches the whole frame by itself.
 
-    Attributes
-    ----------
-    min_score
-        Minimum score, in log-odds, of the boxes that count as positive windows.
+    `min_score` is the minimum score, in log-odds, of the boxes that count as positive windows.
 
-    Examples
-    --------
     >>> FunctionParams(min_score=1).min_score
     1
     """
@@ -79,18 +74,19 @@ class FunctionModel:
                 f"function must be a function of an image, got {describe(self.function)}; it returns boxes "
                 "and scores"
             )
-        object.__setattr__(self, "thread_safe", check_bool(self.thread_safe, "thread_safe"))
-        if self.name is not None:
-            check_type(self.name, "name", str, "omit it for the function's name")
-        name = self.name or getattr(self.function, "__name__", type(self.function).__name__)
-        object.__setattr__(self, "score", check_score_scale(self.score, self.threshold))
-        object.__setattr__(self, "name", name)
-        if self.class_ids is not None:
-            object.__setattr__(self, "class_ids", check_class_ids(self.class_ids))
+        vars(self)["thread_safe"] = check_bool(self.thread_safe, "thread_safe")
+        check_type(self.name, "name", str | None, "omit it for the function's name")
+        lock = self._lock
         if self.thread_safe:
-            object.__setattr__(self, "_lock", contextlib.nullcontext())
-        elif self._lock is None or isinstance(self._lock, contextlib.nullcontext):
-            object.__setattr__(self, "_lock", threading.Lock())
+            lock = contextlib.nullcontext()
+        elif lock is None or isinstance(lock, contextlib.nullcontext):
+            lock = threading.Lock()
+        vars(self).update(
+            name=self.name or getattr(self.function, "__name__", type(self.function).__name__),
+            score=check_score_scale(self.score, self.threshold),
+            class_ids=None if self.class_ids is None else check_class_ids(self.class_ids),
+            _lock=lock,
+        )
 
     def __copy__(self) -> Self:
         """Return the model itself, because a copy would have a lock of its own."""
@@ -118,8 +114,7 @@ class FunctionModel:
                 f"conf must be None for scores on a scale of their own, got {conf:g}; change the lower end "
                 "of score=(low, high), or return probabilities"
             )
-        threshold = conf if self.score == "probability" else logit(conf)
-        return dataclasses.replace(self, threshold=threshold)
+        return dataclasses.replace(self, threshold=conf if self.score == "probability" else logit(conf))
 
     def open_search(self, jobs: int | None = None) -> FunctionSearch:
         """Open a search of frames that calls the function; `jobs` has no effect."""
@@ -145,41 +140,39 @@ class FunctionModel:
             ) from error
         try:
             found = self._convert(returned)
-            _check_pixels(found.boxes)
         except InvalidInputError as error:
             raise DetectorError(
                 f"the function {self.name} returned an invalid result for a frame of {width}x{height} "
                 f"pixels: {error}"
             ) from error
-        boxes = clip_boxes(found.boxes.astype(np.float64), frame.shape)
-        inside = box_areas(boxes) > 0
-        return Detections(boxes[inside], found.scores[inside])
+        clipped = Detections(clip_boxes(found.boxes.astype(np.float64), frame.shape), found.scores)
+        return clipped[box_areas(clipped.boxes) > 0]
 
     def _convert(self, returned: Any) -> Detections:
-        if hasattr(returned, "xyxy"):
-            return Detections.from_supervision(
-                returned, score=self.score, threshold=self.threshold, class_ids=self.class_ids
-            )
+        """Return detections of what the function returned; boxes within one pixel are fractions."""
         if isinstance(returned, Detections):
             returned = (returned.boxes, returned.scores)
-        if not isinstance(returned, (tuple, list)) or len(returned) not in (2, 3):
+        if hasattr(returned, "xyxy"):
+            found = Detections.from_supervision(
+                returned, score=self.score, threshold=self.threshold, class_ids=self.class_ids
+            )
+        elif isinstance(returned, (tuple, list)) and len(returned) in (2, 3):
+            found = Detections(returned[0], log_odds(returned[1], self.score, self.threshold))
+            if self.class_ids is not None:
+                classes = returned[2] if len(returned) == 3 else None
+                found = select_classes(found, classes, self.class_ids)
+        else:
             raise InvalidInputError(
                 f"expected (boxes, scores) or (boxes, scores, classes), got {describe(returned)}; for an "
                 "image without vehicles return ([], [])"
             )
-        found = Detections(returned[0], log_odds(returned[1], self.score, self.threshold))
-        if self.class_ids is None:
-            return found
-        return select_classes(found, returned[2] if len(returned) == 3 else None, self.class_ids)
-
-
-def _check_pixels(boxes: NDArray[Any]) -> None:
-    """Raise if all boxes lie within one pixel: fractions of the frame."""
-    if boxes.size and boxes.min() >= 0 and boxes.max() <= 1 and (box_areas(boxes) > 0).any():
-        raise InvalidInputError(
-            f"boxes must be in pixels, got {boxes.min():g} to {boxes.max():g}, as fractions of the frame "
-            "are; multiply x by its width and y by its height"
-        )
+        boxes = found.boxes
+        if boxes.size and boxes.min() >= 0 and boxes.max() <= 1 and (box_areas(boxes) > 0).any():
+            raise InvalidInputError(
+                f"boxes must be in pixels, got {boxes.min():g} to {boxes.max():g}, as fractions of the frame "
+                "are; multiply x by its width and y by its height"
+            )
+        return found
 
 
 class FunctionSearch(FrameSearch):
@@ -215,8 +208,7 @@ def detector_from(
     function
         Called with an ``(H, W, 3)`` uint8 RGB image of its own. It returns ``(boxes, scores)``, ``(N, 4)``
         ``[x1, y1, x2, y2]`` in pixels and ``(N,)``, or ``(boxes, scores, classes)``; or `Detections`, or an
-        object with ``xyxy``, such as ``supervision.Detections`` and the ``boxes`` of Ultralytics' results
-        (see `Detections.from_supervision`). Boxes are clipped to the image. It should
+        object with ``xyxy`` (see `Detections.from_supervision`). Boxes are clipped to the image. It should
         return weak boxes as well: the tracker uses them, images show only those above the threshold.
     score
         What the scores are. They are converted to log-odds above the threshold, the unit of `TrackParams`:
@@ -225,29 +217,19 @@ def detector_from(
     threshold
         Score from which a box is a vehicle in a single image: by default 0.5 for probabilities and 0 for
         log-odds. Pass 0.25 if that is the usual threshold of your detector.
-    class_ids
-        Keep only boxes of these classes, integers as the function returns them.
+    class_ids, name
+        Keep only boxes of these classes, integers as the function returns them; and name in messages.
     thread_safe
-        Whether the function may be called from several threads. `process_video` searches several frames at
-        once; with False the calls wait for each other. Sessions of ONNX Runtime and the ``predict`` of
-        scikit-learn are thread-safe.
-    name
-        Name in messages; by default that of the function.
+        Whether the function may be called from several threads, as `process_video` does; otherwise the calls
+        wait for each other. Sessions of ONNX Runtime and the ``predict`` of scikit-learn are thread-safe.
     **options
         Further arguments of `VehicleDetector`, such as ``track_params`` and ``camera``.
 
-    Returns
-    -------
-    VehicleDetector
-        Its `detect`, `process`, `annotate_clip` and so on work as with the shipped models.
-
     Raises
     ------
-    InvalidInputError
-        If an argument is malformed.
     DetectorError
-        In the methods of the detector, if the function fails or returns something else; the message names
-        the function and the frame.
+        In the methods of the detector, if the function fails or returns something else; the message names the
+        function and the frame.
 
     Notes
     -----
@@ -266,12 +248,5 @@ def detector_from(
     >>> detector.detect(image).boxes.tolist()
     [[80.0, 30.0, 120.0, 70.0]]
     """
-    model = FunctionModel(
-        function=function,
-        score=score,
-        threshold=threshold,
-        class_ids=class_ids,
-        thread_safe=thread_safe,
-        name=name,
-    )
-    return VehicleDetector(model, **options)
+    own: Any = {"threshold": threshold, "class_ids": class_ids, "thread_safe": thread_safe, "name": name}
+    return VehicleDetector(FunctionModel(function=function, score=score, **own), **options)

@@ -87,11 +87,6 @@ def find_vehicles(
     Detections
         Float boxes clipped to the frame; a box's score is the best score in its group.
 
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed.
-
     Notes
     -----
     The grouping is one mean-shift step from the best window, in the space of positions and logarithmic sizes
@@ -107,11 +102,10 @@ def find_vehicles(
     >>> find_vehicles(windows, camera, (720, 1280)).boxes.round().astype(int)
     array([[608, 385, 676, 448]])
     """
-    params = RegionParams() if params is None else params
     check_type(windows, "windows", Detections, "pass Detections(boxes, scores)")
     check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
-    check_type(params, "params", RegionParams, "omit it for the default")
-    frame = check_shape(shape)
+    check_type(params, "params", RegionParams | None, "omit it for the default")
+    params, frame = params or RegionParams(), check_shape(shape)
     return fit_boxes(group_windows(windows, params), camera.for_shape(frame), frame, params)
 
 
@@ -171,10 +165,9 @@ def fit_boxes(groups: Detections, camera: Camera, shape: tuple[int, ...], params
 def _on_other_vehicles(
     faces: Floats, boxes: Floats, peaks: Floats, params: RegionParams
 ) -> NDArray[np.bool_]:
-    """Mark the groups whose face lies in the box of another group, because windows fire on sides too.
+    """Mark the groups to drop whose face lies in the box of another group: windows fire on sides too.
 
-    If two groups lie on each other, the better one stays. A group that only lies on the other's side is
-    dropped even if it is the better one, unless the other is much weaker.
+    If two groups lie on each other, the better one stays.
     """
     areas = box_areas(faces)
     lies_on = intersection_matrix(faces, boxes) > params.max_coverage * areas[:, None]

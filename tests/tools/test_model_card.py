@@ -7,9 +7,7 @@ from tests.helpers import drawn
 from tools.model_card import calibration_rows, write_card
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames
-from vehicle_detection.network import NetworkModel
-from vehicle_detection.network.inputs import InputFormat
-from vehicle_detection.network.outputs import OutputFormat
+from vehicle_detection.network import InputFormat, NetworkModel, OutputFormat
 from vehicle_detection.tables import TrackTable
 from vehicle_detection.training import FoldDetections, FrameDataset
 

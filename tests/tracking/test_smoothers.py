@@ -5,12 +5,14 @@ import pytest
 
 from vehicle_detection.tracking import TrackParams
 from vehicle_detection.tracking.kalman import (
+    HistorySmoother,
     KalmanSmoother,
     KalmanStates,
     Measurements,
+    NearestSmoother,
     centers_and_sizes,
+    make_smoother,
 )
-from vehicle_detection.tracking.smoothers import HistorySmoother, NearestSmoother, make_smoother
 from vehicle_detection.tracking.track import TrackState
 
 SHAPE = (720, 1280)

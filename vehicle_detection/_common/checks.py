@@ -8,7 +8,7 @@ import os
 from collections.abc import Collection, Iterable
 from numbers import Real
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, TypeGuard, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,10 +42,11 @@ def shorten(text: str, length: int = 80) -> str:
     return text if len(text) <= length else text[: length - 3] + "..."
 
 
-def check_type(value: object, name: str, kind: type | tuple[type, ...], remedy: str) -> None:
-    """Raise unless `value` is an instance of `kind`, or of one of several."""
+def check_type(value: object, name: str, kind: Any, remedy: str) -> None:
+    """Raise unless `value` is an instance of `kind`: a class, a union such as ``Camera | None``, a tuple."""
     if not isinstance(value, kind):
-        names = " or ".join(each.__name__ for each in (kind if isinstance(kind, tuple) else (kind,)))
+        kinds = kind if isinstance(kind, tuple) else get_args(kind) or (kind,)
+        names = " or ".join(each.__name__ for each in kinds if each is not type(None))
         article = "an" if names[0] in "AEIOU" else "a"
         raise InvalidInputError(f"{name} must be {article} {names}, got {describe(value)}; {remedy}")
 

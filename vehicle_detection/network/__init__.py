@@ -1,6 +1,5 @@
 """Networks in ONNX files: the shipped one, and those of other detectors."""
 
-from vehicle_detection.network.inputs import InputFormat, fit_input
 from vehicle_detection.network.loading import (
     FORMAT_VERSION,
     METADATA_KEY,
@@ -8,8 +7,8 @@ from vehicle_detection.network.loading import (
     load_network,
 )
 from vehicle_detection.network.model import NetworkModel, NetworkParams, NetworkSearch
-from vehicle_detection.network.outputs import Candidates, OutputFormat
 from vehicle_detection.network.runtime import Device, GraphFacts, Session, open_session, read_facts
+from vehicle_detection.network.tensors import Candidates, InputFormat, OutputFormat, fit_input
 
 __all__ = [
     "FORMAT_VERSION",

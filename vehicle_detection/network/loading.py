@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Collection, Mapping
 from importlib import resources
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.boxes import logit
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.network.inputs import InputFormat, Size
 from vehicle_detection.network.model import INPUT_SIZE, NetworkModel, NetworkParams
-from vehicle_detection.network.outputs import OutputFormat, class_names, recognize, usual_names
 from vehicle_detection.network.runtime import (
     Device,
     GraphFacts,
@@ -31,6 +30,14 @@ from vehicle_detection.network.runtime import (
     check_device,
     open_session,
     read_facts,
+)
+from vehicle_detection.network.tensors import (
+    InputFormat,
+    OutputFormat,
+    Size,
+    class_names,
+    recognize,
+    usual_names,
 )
 
 METADATA_KEY = "vehicle_detection"
@@ -58,33 +65,9 @@ def load_network(
 
     Networks of other detectors are YOLOv5, v8, v10, 11 and 26, YOLOX, RT-DETR, RF-DETR, D-FINE and others
     with the same outputs. Their default threshold is a probability of 0.25, as usual, and 0.5 for those of
-    the DETR family, and their probabilities are not calibrated.
-
-    Parameters
-    ----------
-    path
-        The file, or ``"default"`` for the shipped network.
-    classes
-        Names or numbers of the classes to keep. Default: those named car, truck, bus, van or vehicle, in any
-        case; all classes if their names are unknown.
-    device
-        ``"cpu"``, or ``"cuda"`` with the package onnxruntime-gpu.
-    runtime
-        ``"onnxruntime"``, ``"openvino"``, or ``"auto"``: OpenVINO if it is installed and the processor
-        multiplies matrices (AMX).
-
-    Returns
-    -------
-    NetworkModel
-        A model for `VehicleDetector`.
-
-    Raises
-    ------
-    ModelFileError
-        If the file is missing, damaged, too large, or no network that finds boxes.
-    InvalidInputError
-        If an argument is malformed, a class is unknown, none has the name of a vehicle and `classes` is
-        omitted, or the device or the library is not available.
+    the DETR family, and their probabilities are not calibrated. `path`, `classes` and `device` are those of
+    `load_model`; `runtime` is ``"onnxruntime"``, ``"openvino"``, or ``"auto"``: OpenVINO if it is installed
+    and the processor multiplies matrices (AMX).
     """
     check_device(device, runtime)
     graph, name = _read(path)
@@ -122,10 +105,10 @@ def _own_model(graph: bytes, facts: GraphFacts) -> NetworkModel:
                 f"{name} has format version {header['format_version']}, this release reads {FORMAT_VERSION}; "
                 "train again or install the release that wrote it"
             )
-        params, metadata = header["params"], dict(header["metadata"])
+        params, image, boxes = header["params"], facts.inputs[0], facts.outputs[0]
         size = int(params["input_size"])
         NetworkParams(input_size=size)
-        image, boxes = facts.inputs[0], facts.outputs[0]
+        scores: Any = {name: float(params[name]) for name in ("slope", "offset", "threshold", "nms_iou")}
         is_image = image.dtype == "uint8" and len(image.shape) == 4
         if not is_image or len(boxes.shape) != 3 or boxes.shape[1] not in (5, None):
             raise ValueError(f"input {image.dtype} {image.shape}, output {boxes.shape}")
@@ -137,11 +120,8 @@ def _own_model(graph: bytes, facts: GraphFacts) -> NetworkModel:
             input_name=image.name,
             input_size=size,
             classes={0: "vehicle"},
-            slope=float(params["slope"]),
-            offset=float(params["offset"]),
-            threshold=float(params["threshold"]),
-            nms_iou=float(params["nms_iou"]),
-            metadata=metadata,
+            metadata=dict(header["metadata"]),
+            **scores,
         )
     except (InvalidInputError, LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
         raise ModelFileError(f"{name} does not fit its own parameters: {error}; train again") from error
@@ -154,8 +134,7 @@ def _foreign_model(graph: bytes, facts: GraphFacts) -> NetworkModel:
         raise ModelFileError(
             f"{name} is a network for the task {metadata['task']!r}; export one for detection"
         )
-    _check_inputs(facts)
-    image, *extra = facts.inputs
+    image, *extra = _check_inputs(facts)
     channels_first = image.shape[1] == 3 or image.shape[3] != 3
     size = _fixed_size(image, channels_first, name)
     names = class_names(facts)
@@ -171,9 +150,8 @@ def _foreign_model(graph: bytes, facts: GraphFacts) -> NetworkModel:
         metadata=dict(metadata),
     )
     tried = size or (_PROBE_SIZE, _PROBE_SIZE)
-    output_format = recognize(
-        facts, _output_shapes(model, facts, tried), tried, None if names is None else len(names)
-    )
+    shapes = _output_shapes(model, facts, tried)
+    output_format = recognize(facts, shapes, tried, None if names is None else len(names))
     is_set = output_format.normalized or output_format.kind == "lists"
     yolox = output_format.kind == "yolox"
     input_format = dataclasses.replace(
@@ -192,8 +170,8 @@ def _foreign_model(graph: bytes, facts: GraphFacts) -> NetworkModel:
     )
 
 
-def _check_inputs(facts: GraphFacts) -> None:
-    """Raise unless the first input is an image, and a second one the size of the image."""
+def _check_inputs(facts: GraphFacts) -> tuple[Port, ...]:
+    """Return the inputs if the first is an image, and a second one the size of the image."""
     image, *extra = facts.inputs or (Port("none", (), ""),)
     fits = (
         len(image.shape) == 4
@@ -209,6 +187,7 @@ def _check_inputs(facts: GraphFacts) -> None:
             f"{facts.name} must have one input, float32, float16 or uint8 of shape (1, 3, height, width) or "
             f"(1, height, width, 3), got {listed}; export it with a batch of 1 and three color channels"
         )
+    return facts.inputs
 
 
 def _fixed_size(image: Port, channels_first: bool, name: str) -> Size | None:

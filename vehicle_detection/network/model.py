@@ -14,20 +14,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    Checked,
-    Floats,
-    atomic_write,
-    integer,
-    number,
-    single_threaded_opencv,
-    store_number,
-)
+from vehicle_detection._common import Checked, Floats, atomic_write, integer, number, single_threaded_opencv
 from vehicle_detection.boxes import Detections, Platt, box_areas, greedy_nms, logit
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.network.inputs import InputFormat, Size
-from vehicle_detection.network.outputs import Candidates, OutputFormat
 from vehicle_detection.network.runtime import Array, Device, Port, Runtime, Session, open_session
+from vehicle_detection.network.tensors import Candidates, InputFormat, OutputFormat, Size
 from vehicle_detection.search import FrameSearch
 
 INPUT_SIZE = 640
@@ -74,30 +65,26 @@ class NetworkParams(Checked):
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class NetworkModel:
-    """A network that finds vehicles; `load_network` creates it.
+class NetworkModel(Checked):
+    """A network that finds vehicles; `load_model` creates it.
 
     Attributes
     ----------
     graph, name
         Content of the ONNX file, and how messages refer to it.
-    input_format, output_format
-        How to make its input, and to decode its outputs.
-    input_size
-        Longer side of its input in pixels, unless `NetworkParams` has one.
-    classes
-        Names of the classes by their numbers; None if they are unknown.
-    class_ids
-        Numbers of the classes to keep; None: all.
+    input_format, output_format, input_size
+        How to make its input, and to decode its outputs; and longer side of its input, unless `NetworkParams`
+        has one.
+    classes, class_ids
+        Names of the classes by their numbers, None if they are unknown; and numbers of those to keep, None:
+        all.
     slope, offset
         Platt scaling: ``slope * logit(p) + offset`` is the log-odds that a box contains a vehicle, given its
         probability in the network's output.
-    threshold
-        Minimum log-odds of a vehicle.
-    nms_iou
-        IoU above which the less probable box is dropped.
+    threshold, nms_iou
+        Minimum log-odds of a vehicle; and IoU above which the less probable box is dropped.
     device, runtime
-        Arguments of `load_network`.
+        Where it runs, and the library that runs it.
     metadata
         Training facts stored in the file, or its ONNX metadata.
 
@@ -121,19 +108,13 @@ class NetworkModel:
     input_size: int = INPUT_SIZE
     classes: Mapping[int, str] | None = None
     class_ids: NDArray[np.intp] | None = None
-    slope: float = 1.0
-    offset: float = 0.0
-    threshold: float = 0.0
-    nms_iou: float = 0.6
+    slope: float = number(1.0, above=0, high=1e9)
+    offset: float = number(0.0, low=-1e9, high=1e9)
+    threshold: float = number(0.0, low=-1e9, high=1e9)
+    nms_iou: float = number(0.6, low=0, high=1)
     device: Device = "cpu"
     runtime: Runtime = "auto"
     metadata: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        store_number(self, "slope", above=0, high=1e9)
-        store_number(self, "offset", low=-1e9, high=1e9)
-        store_number(self, "threshold", low=-1e9, high=1e9)
-        store_number(self, "nms_iou", low=0, high=1)
 
     @property
     def calibration(self) -> Platt:
@@ -196,10 +177,7 @@ class NetworkModel:
 
 
 class NetworkSearch(FrameSearch):
-    """The search of frames with a network; vehicles lie inside the frame.
-
-    The network's session is opened by the first search.
-    """
+    """The search of frames with a network, whose session the first search opens."""
 
     params_type = NetworkParams
 
@@ -220,13 +198,9 @@ class NetworkSearch(FrameSearch):
         self, frame: NDArray[np.uint8], params: NetworkParams, min_vehicle_score: float
     ) -> tuple[Detections, Detections]:
         candidates = self.find_candidates(frame, params, min(min_vehicle_score, params.min_score))
-        boxes, scores = candidates.boxes, self.model.scores(candidates.scores)
-        kept = greedy_nms(boxes, scores, max_iou=self.model.nms_iou)
-        vehicles = Detections(boxes[kept], scores[kept])
-        return (
-            Detections(boxes, scores)[scores >= params.min_score],
-            vehicles[vehicles.scores >= min_vehicle_score],
-        )
+        found = Detections(candidates.boxes, self.model.scores(candidates.scores))
+        vehicles = found[greedy_nms(found.boxes, found.scores, max_iou=self.model.nms_iou)]
+        return found[found.scores >= params.min_score], vehicles[vehicles.scores >= min_vehicle_score]
 
     def find_candidates(
         self, frame: NDArray[np.uint8], params: NetworkParams, min_score: float
@@ -244,20 +218,19 @@ class NetworkSearch(FrameSearch):
             raise ModelFileError(
                 f"{model.name} computes invalid values: {error}; download or export it again"
             ) from error
-        boxes = _to_frame(found.boxes, frame.shape, scaled)
+        # From the input, in which the frame has the size `scaled`, to pixels of the frame.
+        height, width = frame.shape[:2]
+        factors = np.array([width / scaled[1], height / scaled[0]] * 2)
+        boxes = np.clip(found.boxes * factors, 0.0, [width, height, width, height])
         inside = box_areas(boxes) > 0
         return Candidates(boxes[inside], found.scores[inside], found.class_ids[inside])
 
     def _open(self) -> Session:
         with self._lock:
             if self._session is None:
-                model = self.model
+                model, jobs = self.model, self._team.n_threads
                 self._session = open_session(
-                    model.graph,
-                    model.name,
-                    jobs=self._team.n_threads,
-                    device=model.device,
-                    runtime=model.runtime,
+                    model.graph, model.name, jobs=jobs, device=model.device, runtime=model.runtime
                 )
             return self._session
 
@@ -281,13 +254,6 @@ def _after_fork() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
-
-
-def _to_frame(boxes: Floats, shape: tuple[int, ...], scaled: tuple[int, int]) -> Floats:
-    """Boxes in pixels of the frame, clipped to it; `scaled` is the frame's height and width in the input."""
-    height, width = shape[:2]
-    factors = np.array([width / scaled[1], height / scaled[0]] * 2)
-    return np.asarray(np.clip(boxes * factors, 0.0, [width, height, width, height]))
 
 
 def to_log_odds(probabilities: Floats) -> Floats:

@@ -65,25 +65,9 @@ def open_session(
     device: Device = "cpu",
     runtime: Runtime = "auto",
 ) -> Session:
-    """Make a graph ready to run.
+    """Make a graph ready to run on a device, with a number of threads that share one run.
 
-    Parameters
-    ----------
-    graph, name
-        Content of an ONNX file, and how messages refer to it.
-    jobs
-        Threads that share one run.
-    device
-        ``"cpu"`` or ``"cuda"``.
-    runtime
-        ``"onnxruntime"``, ``"openvino"``, or the faster one of those installed, ``"auto"``.
-
-    Raises
-    ------
-    ModelFileError
-        If the file is damaged, no ONNX file, or needs other files or operators.
-    InvalidInputError
-        If the device or the library is not available.
+    A `ModelFileError` is raised if the file is damaged, no ONNX file, or needs other files or operators.
     """
     n_threads = resolve_jobs(jobs)
     check_device(device, runtime)

@@ -12,10 +12,14 @@ uniform colormaps.
 
 from __future__ import annotations
 
-from vehicle_detection.notebook.birds_eye import plot_birds_eye
-from vehicle_detection.notebook.explanation import plot_explanation
 from vehicle_detection.notebook.explorer import Explorer
-from vehicle_detection.notebook.features import plot_channels, plot_features, plot_hog, plot_weights
+from vehicle_detection.notebook.features import (
+    plot_channels,
+    plot_explanation,
+    plot_features,
+    plot_hog,
+    plot_weights,
+)
 from vehicle_detection.notebook.images import (
     ImageDescription,
     describe_image,
@@ -40,7 +44,7 @@ from vehicle_detection.notebook.search import (
     plot_speedups,
     plot_windows,
 )
-from vehicle_detection.notebook.tracks import plot_stage_times, plot_tracks
+from vehicle_detection.notebook.tracks import plot_birds_eye, plot_stage_times, plot_tracks
 
 __all__ = [
     "Explorer",

@@ -228,8 +228,8 @@ class Explorer:
         """Change how windows become boxes; None keeps a value.
 
         `threshold`, `peak_fraction` and `weighting` are fields of `HeatParams`, for the method ``"heat"``;
-        `min_peak` and `min_evidence` are fields of `RegionParams`, for ``"groups"``, and have no effect if
-        the model predicts boxes.
+        `min_peak` and `min_evidence` of `RegionParams`, for ``"groups"``, without effect if the model
+        predicts boxes.
         """
         method = self.method if method is None else method
         check_choice(method, "method", METHODS)
@@ -281,10 +281,7 @@ class Explorer:
         return list(np.argsort(-self.boxes().scores, kind="stable").tolist())
 
     def box_at(self, x: float, y: float) -> int:
-        """Return the number, as in `set_box`, of the smallest box that holds a point; 0 if none does.
-
-        `x` and `y` are in pixels of the frame, not of the reduced image.
-        """
+        """Return the number, as in `set_box`, of the smallest box at a pixel of the frame; 0: none."""
         x, y = check_number(x, "x"), check_number(y, "y")
         boxes = self.boxes().boxes
         left, top, right, bottom = boxes.T

@@ -1,4 +1,4 @@
-"""Figures of the features: color channels, HOG, the feature vector, and the weights of a classifier."""
+"""Figures of the features: color channels, HOG, feature vectors, weights, and what they add to a score."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import Explanation
 from vehicle_detection.features import (
     COLOR_SPACES,
     PATCH_SIZE,
@@ -32,7 +33,17 @@ from vehicle_detection.features import (
     sum_blocks,
 )
 from vehicle_detection.notebook import style
-from vehicle_detection.notebook.style import COLORS, LINE_COLORS, OTHER, VEHICLE, FigureLike, Image
+from vehicle_detection.notebook.style import (
+    BLUE,
+    COLORS,
+    LINE_COLORS,
+    OTHER,
+    VEHICLE,
+    VERMILION,
+    YELLOW,
+    FigureLike,
+    Image,
+)
 from vehicle_detection.svm import CLASSIFIER_REMEDY, Template, VehicleClassifier
 
 if TYPE_CHECKING:
@@ -41,6 +52,10 @@ if TYPE_CHECKING:
 
 # Thin lines for glyphs of more cells per row than this.
 _MANY_CELLS = 24
+
+# Part of the image around an explained window, as a fraction of the window's longer side, and opacity of the
+# cell with the largest share.
+_AROUND, _MAX_ALPHA = 0.25, 0.75
 
 _CHANNEL_NAMES = {"YCrCb": ("Y", "Cr", "Cb"), "LAB": ("L", "a", "b")}
 _CHANNEL_PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -65,7 +80,7 @@ def add_glyphs(
     """Draw a line along the edge for each cell and orientation of ``(rows, columns, orient)`` > 0.
 
     The brightness is the value, relative to `peak` (None: the maximum). A cell has the side `size` in data
-    coordinates.
+    units.
     """
     from matplotlib.collections import LineCollection
 
@@ -100,9 +115,7 @@ def plot_channels(
     random_state: int = 0,
     figure: FigureLike | None = None,
 ) -> FigureLike:
-    """Plot the distribution of pixels in a color space: each channel, and pairs of channels.
-
-    Above are histograms of the channels over all pixels, below scatter plots of pairs of channels.
+    """Plot the distribution of pixels in a color space, of each channel and of pairs of channels.
 
     Parameters
     ----------
@@ -237,12 +250,10 @@ def plot_features(
     template: int = 0,
     figure: FigureLike | None = None,
 ) -> FigureLike:
-    """Plot feature vectors before and after scaling, with their parts shaded.
+    """Plot feature vectors, a line per row, before and after scaling, with their parts shaded.
 
     Before scaling, histogram counts are much larger than HOG values; after scaling, all parts have the same
     range.
-
-    There are two panels with one line per row: the vector before and after scaling.
 
     Parameters
     ----------
@@ -318,20 +329,13 @@ _MAX_SHIFT = 110.0
 def plot_weights(
     classifier: VehicleClassifier, *, template: int = 0, figure: FigureLike | None = None
 ) -> FigureLike:
-    """Draw the weights of a linear SVM template, arranged as in the window.
+    """Draw the weights of a classifier's template, arranged as in the window, with a row for each channel.
 
     The weights belong to the scaled features, so they are comparable. HOG weights are summed over the blocks
     of each cell and drawn as edges, positive and negative ones separately (Dalal and Triggs, CVPR 2005,
-    figure 6).
-
-    There is a row for each channel. Columns: positive and negative weights of HOG and of coarse HOG, weights
-    of the spatial bins and of the histogram, as far as the model uses them. With spatial bins, the last
-    column shows the mean patch, and the mean patch shifted along the weights in both directions.
-
-    Parameters
-    ----------
-    classifier, template
-        The trained model, and the number of its template.
+    figure 6). The other columns are the weights of coarse HOG, of the spatial bins and of the histogram, as
+    far as the model uses them; with spatial bins also the mean patch, shifted along the weights in both
+    directions.
 
     Examples
     --------
@@ -417,3 +421,63 @@ def _add_shifted_patches(column: NDArray[Any], template: Template, params: Featu
             patch = np.asarray(cv2.cvtColor(patch, conversion), np.uint8)
         style.add_image(panel, patch)
         panel.set_xlabel(name, fontsize=9)
+
+
+def plot_explanation(
+    image: Image, explanation: Explanation, *, figure: FigureLike | None = None
+) -> FigureLike:
+    """Draw why a detector finds a vehicle in a box, given the image and what `explain` returned for it.
+
+    Three panels: the vehicle with its box; the same with the cells of the window, orange where a cell speaks
+    for a vehicle and blue where it speaks against one, the stronger the more; and the terms of the margin
+    with their sum.
+
+    Examples
+    --------
+    >>> from vehicle_detection import VehicleDetector, explain
+    >>> road = np.full((360, 640, 3), 90, np.uint8)
+    >>> figure = plot_explanation(road, explain(VehicleDetector(), road, [300, 200, 360, 250]))
+    >>> [panel.get_title() for panel in figure.axes][:2]
+    ['not found', 'share of each cell, orange: for a vehicle']
+    """
+    from matplotlib.colors import to_rgb
+
+    height, width = check_image(image).shape[:2]
+    check_type(explanation, "explanation", Explanation, "pass what explain returned")
+    figure, grid = style.new_panels(figure, (10.5, 3.6), 1, 3)
+    plain, shares, sums = grid.flat
+    score = "not found" if explanation.score is None else f"score {explanation.score:.2f}"
+    left, top, right, bottom = explanation.window.tolist()
+    both = explanation.window, explanation.box
+    first, last = np.minimum(*both), np.maximum(*both)
+    around = _AROUND * max(right - left, bottom - top)
+    for panel, title in ((plain, score), (shares, "share of each cell, orange: for a vehicle")):
+        style.add_image(panel, image, title)
+        style.add_boxes(panel, explanation.box[None], YELLOW)
+        panel.set_xlim(max(first[0] - around, -0.5), min(last[2] + around, width - 0.5))
+        panel.set_ylim(min(last[3] + around, height - 0.5), max(first[1] - around, -0.5))
+    peak = float(np.abs(explanation.cells).max()) or 1.0
+    colors = np.empty((*explanation.cells.shape, 4))
+    colors[..., :3] = np.where(explanation.cells[..., None] > 0, to_rgb(VERMILION), to_rgb(BLUE))
+    colors[..., 3] = _MAX_ALPHA * np.abs(explanation.cells) / peak
+    limits = shares.get_xlim(), shares.get_ylim()
+    shares.imshow(colors, extent=(left, right, bottom, top), interpolation="nearest", zorder=2)
+    shares.set(xlim=limits[0], ylim=limits[1])
+    names, values = list(explanation.terms), list(explanation.terms.values())
+    ends = np.concatenate(([0.0], np.cumsum(values)))
+    starts = ends[:-1]
+    rows = np.arange(len(values))
+    sums.barh(rows, values, left=starts, color=[VERMILION if value > 0 else BLUE for value in values])
+    for row, start, value in zip(rows.tolist(), starts.tolist(), values):
+        end = max(start, start + value), row
+        # White behind the text, which the line of the margin may cross.
+        options = {"bbox": {"facecolor": "white", "edgecolor": "none", "pad": 1}, "fontsize": 9}
+        sums.annotate(f"{value:+.2f}", end, (4, 0), textcoords="offset points", va="center", **options)
+    sums.axvline(explanation.margin, color="black", linestyle="--", linewidth=1)
+    sums.axvline(0, color="gray", linewidth=0.8)
+    sums.set_yticks(rows, names)
+    sums.invert_yaxis()
+    room = 0.25 * max(np.ptp(ends), 0.1)
+    sums.set_xlim(ends.min() - 0.2 * room, ends.max() + room)
+    sums.set_title(f"margin {explanation.margin:.2f}", fontsize=9)
+    return figure

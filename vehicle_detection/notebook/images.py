@@ -44,11 +44,6 @@ def describe_image(image: NDArray[Any]) -> ImageDescription:
 
     It tells, for example, a PNG that was read as floats from 0 to 1 from a JPEG of integers from 0 to 255.
 
-    Parameters
-    ----------
-    image
-        Any array of numbers with at least one value.
-
     Examples
     --------
     >>> print(describe_image(np.full((2, 3, 3), 7, np.uint8)))
@@ -129,14 +124,8 @@ def plot_methods(
 ) -> FigureLike:
     """Show the boxes that several methods find in the same images: one row per image, one column per method.
 
-    Parameters
-    ----------
-    images, truth
-        ``(H, W, 3)`` uint8 RGB, with the keys of a mapping as names of the rows; and labelled boxes of each
-        image, drawn with dashed lines.
-    methods
-        For each method, its detections in each image.
-    figure : matplotlib.figure.Figure or SubFigure, optional
+    `methods` holds the detections in each image by the name of a method; `images` and `truth` are as in
+    `show_images`.
 
     Examples
     --------
@@ -178,10 +167,9 @@ def plot_patches(
 
     Parameters
     ----------
-    patches
-        A set, or ``(H, W, 3)`` images.
-    count, columns
-        Maximum number of patches, chosen at even distances if there are more, and patches per row.
+    patches, count, columns
+        A set, or ``(H, W, 3)`` images; maximum number, chosen at even distances if there are more; and
+        patches per row.
     labels
         ``(N,)`` 1 for a vehicle, 0 for anything else. None takes those of a set, or draws no edges.
     captions, scores
@@ -227,14 +215,7 @@ def plot_patches(
 
 
 def plot_balance(patch_set: PatchSet, *, ax: Axes | None = None) -> Axes:
-    """Plot the number of patches of each source and class, and the percentage of each class.
-
-    Vehicles come first.
-
-    Parameters
-    ----------
-    patch_set
-        The patches.
+    """Plot the number of patches of each source and class, vehicles first, and the percentage of each class.
 
     Examples
     --------

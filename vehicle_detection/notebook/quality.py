@@ -47,14 +47,13 @@ def plot_scores(
 ) -> Axes:
     """Plot histograms of the scores of both classes, on a logarithmic scale that makes errors visible.
 
-    The legend counts the errors at the threshold, which is the vertical line.
-
     Parameters
     ----------
     scores, labels
         ``(N,)`` decision values, and ``(N,)`` 1 for a vehicle, 0 for anything else.
     threshold, bins
-        Score above which a patch is classified as a vehicle, and number of bins over the range of the scores.
+        Score above which a patch is classified as a vehicle: the vertical line, at which the legend counts
+        the errors; and number of bins over the range of the scores.
 
     Examples
     --------
@@ -104,12 +103,8 @@ def plot_precision_recall(
 ) -> Axes:
     """Plot precision against recall for all score thresholds, with lines of equal F1.
 
-    Parameters
-    ----------
-    curves, threshold
-        A result of `precision_recall_curve`, or a mapping from names to several; and a threshold to mark with
-        a square. A dot marks the best F1.
-    ax : matplotlib.axes.Axes, optional
+    `curves` is a result of `precision_recall_curve`, or a mapping from names to several; a square marks the
+    `threshold`, a dot the best F1.
 
     Examples
     --------
@@ -166,12 +161,11 @@ def plot_f1(
 ) -> Axes:
     """Plot a metric on each source of frames as bars, for one detector or several.
 
-    An unknown value has no bar.
-
     Parameters
     ----------
     scores
-        Results of `evaluate_detections` by source; or by detector, then by source.
+        Results of `evaluate_detections` by source; or by detector, then by source. Unknown values have no
+        bar.
     metric
         ``"f1"``, ``"precision"``, ``"recall"``, ``"average_precision"`` or ``"mean_iou"``.
 
@@ -229,8 +223,8 @@ def plot_errors(
     frames, predictions
         Frames with their true boxes; and predicted boxes with scores, as `TrackTable.from_detections` makes.
     kind
-        ``"missed"``: labelled vehicles without a detection, largest first, with the largest IoU of any
-        detection. ``"false"``: detections without a labelled vehicle, highest score first.
+        ``"missed"``: labelled vehicles without a detection, with the largest IoU of any detection;
+        ``"false"``: detections without a labelled vehicle.
     iou, count, columns
         Minimum IoU of a detection and its vehicle; maximum number of errors to show; and crops per row.
 
@@ -393,7 +387,7 @@ def plot_parameter(
     Parameters
     ----------
     table
-        Results of `compare_configurations` or `search_parameters`; rows without the measurement are left out.
+        As in `plot_tradeoff`; rows without the measurement are left out.
     parameter, quality, by
         Columns of the x axis, such as ``"C"``, of the y axis, a measurement, and of the groups of rows that
         form lines, such as ``"split"``, None for one line.

@@ -31,7 +31,7 @@ def plot_windows(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw windows on a frame, colored by score.
+    """Draw windows on a frame, colored by score; the title is their number, unless it is given.
 
     The first collection of the Axes holds the windows in ascending order of score, and their scores.
 
@@ -40,8 +40,8 @@ def plot_windows(
     image, windows
         ``(H, W, 3)`` uint8 RGB; and `Detections`, as `find_cars` returns, or ``(N, 4)`` boxes without scores,
         as `slide_window` returns, drawn in one color.
-    truth, title
-        Labelled boxes, drawn with dashed lines; and the title, by default the number of windows.
+    truth
+        Labelled boxes, drawn with dashed lines.
 
     Examples
     --------
@@ -84,13 +84,9 @@ def plot_bands(
 ) -> FigureLike:
     """Draw the search band of each window size: its bounds, the first window, and the next ones.
 
-    Each band that fits into the frame has a panel. Its collections are the bounds, the windows one step to
-    the right and one step down, and the first window; the dashed line is the horizon.
-
-    Parameters
-    ----------
-    image, search
-        ``(H, W, 3)`` uint8 RGB frame, and the bands, by default ``SearchParams.preset()``.
+    Each band of `search` (by default ``SearchParams.preset()``) that fits into the frame has a panel. Its
+    collections are the bounds, the windows one step to the right and one step down, and the first window; the
+    dashed line is the horizon.
 
     Examples
     --------
@@ -135,14 +131,9 @@ def plot_bands(
 
 
 def plot_comparison(fast: ArrayLike, reference: ArrayLike, *, figure: FigureLike | None = None) -> FigureLike:
-    """Plot the scores of the fast search against those of the reference, window by window.
+    """Plot ``(N,)`` scores of the fast search against those of the reference, for the same windows in order.
 
     Beside the scatter plot is a histogram of the differences, whose title states the maximum.
-
-    Parameters
-    ----------
-    fast, reference
-        ``(N,)`` scores of the same windows in the same order, such as ``find_cars(...).scores``.
 
     Examples
     --------
@@ -173,12 +164,9 @@ def plot_comparison(fast: ArrayLike, reference: ArrayLike, *, figure: FigureLike
 def plot_speedups(
     seconds: Mapping[str, float], *, reference: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Plot the times of several methods for the same work, and their speedups over one of them.
+    """Plot the times of several methods for the same work, and their speedups over `reference`.
 
-    Parameters
-    ----------
-    seconds, reference
-        Time of each method; and name of the method to compare the others with, None for the slowest.
+    None for `reference` is the slowest method.
 
     Examples
     --------
@@ -224,8 +212,7 @@ def plot_heatmap(
 ) -> FigureLike:
     """Show how windows become boxes: the windows, their heat map, and the regions above the threshold.
 
-    The three panels are the windows; the heat map with a color bar; and the regions above the threshold in
-    different colors, with the boxes of `label_boxes` as one line collection.
+    The regions have different colors, and the boxes of `label_boxes` are one line collection.
 
     Parameters
     ----------

@@ -94,8 +94,7 @@ def covered_fractions(boxes: Floats, others: Floats) -> Floats:
 def nearer_cover(boxes: Floats, is_opaque: Bools) -> Floats:
     """For each box, the largest fraction of it that a single nearer, opaque box covers; ``(N,)``.
 
-    A vehicle is nearer if its bottom edge is lower. Its box is enlarged by a few percent, because a vehicle
-    that only touches another one hides its edge.
+    That box is enlarged by a few percent, because a vehicle that only touches another one hides its edge.
     """
     sides = boxes[:, 2:] - boxes[:, :2]
     margin = _COVER_MARGIN * np.tile(sides, 2) * np.array([-1.0, -1.0, 1.0, 1.0])
@@ -162,8 +161,7 @@ def merged_detections(
 def cheapest_pairs(cost: NDArray[np.float64], allowed: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Choose allowed pairs of rows and columns: as many as possible, with minimum total cost, rows in order.
 
-    The same as ``scipy.optimize.linear_sum_assignment``, whose package takes 0.3 s and 20 MB to load, in the
-    middle of a video. Here, a frame of a crowded street takes about a millisecond.
+    The same as ``scipy.optimize.linear_sum_assignment``, whose package takes 0.3 s and 20 MB to load.
 
     >>> cheapest_pairs(np.array([[0.1, 0.3], [0.2, 0.9]]), np.ones((2, 2), bool))
     [(0, 1), (1, 0)]

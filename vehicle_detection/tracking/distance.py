@@ -152,10 +152,9 @@ def update_distances(
 
 
 def _width_variance(measured: Measurements, camera: Camera, width_scale: Floats, side: Floats) -> Floats:
-    """Variance of the logarithm of boxes' widths that more frames do not average out, ``(N,)``.
+    """Variance ``(N,)`` of the logarithm of boxes' widths that more frames do not average out.
 
-    `width_scale` is the width in pixels times the distance, and `side` the part of it that a meter of the
-    vehicle's length adds.
+    `width_scale` is the width in pixels times the distance, of which a meter of length adds the part `side`.
     """
     # Detectors cut the long sides of vehicles short, where the whole box would be wider than usual.
     aspect = width_scale / (camera.focal_px * camera.vehicle_height_m)

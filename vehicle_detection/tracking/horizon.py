@@ -138,10 +138,8 @@ class HorizonEstimate:
     horizon, horizon_std
         Row of the horizon as a fraction of the frame's height, 0 at the top, and its standard error; treat
         the estimate as a guess if it exceeds 0.05.
-    camera_height_m
-        Height of the camera above the road in meters, assuming that vehicles are 1.5 m high.
-    n_boxes
-        Number of boxes used.
+    camera_height_m, n_boxes
+        Height of the camera above the road in meters, if vehicles are 1.5 m high; and number of boxes used.
     """
 
     horizon: float
@@ -153,29 +151,16 @@ class HorizonEstimate:
 def estimate_horizon(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> HorizonEstimate:
     """Estimate the height of the horizon from the boxes of vehicles, of one frame or of many.
 
-    On a flat road the bottom edge of a box lies below the horizon by the box's height times the ratio of the
-    camera's height to the vehicle's height: a straight line, whose value at height 0 is the horizon. The
-    box's height is used, because its width includes the side of a vehicle in another lane. The height of most
-    cameras is roughly known (1.35 m, standard deviation 0.3 m), so that boxes of similar sizes suffice. The
-    line is fitted by iteratively reweighted least squares with Tukey's biweight, which ignores trucks and
+    The box's height is used, because its width includes the side of a vehicle in another lane. The height of
+    most cameras is roughly known (1.35 m, standard deviation 0.3 m), so that boxes of similar sizes suffice.
+    The line is fitted by iteratively reweighted least squares with Tukey's biweight, which ignores trucks and
     false boxes (Beaton and Tukey, *Technometrics*, 1974).
 
     Parameters
     ----------
-    boxes
-        ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, at least 4 of them not truncated.
-    shape
-        ``(height, width, ...)`` of the frames.
-
-    Returns
-    -------
-    HorizonEstimate
-        The horizon as a fraction of the height, its standard error, and the height of the camera.
-
-    Raises
-    ------
-    InvalidInputError
-        If too few boxes are not truncated.
+    boxes, shape
+        ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, at least 4 of them not truncated; and ``(height, width, ...)``
+        of the frames.
 
     Examples
     --------

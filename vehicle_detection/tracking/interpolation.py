@@ -15,7 +15,7 @@ from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tracking.track import TIME_TOLERANCE, FrameResult, Track, TrackParams
 
-_INTERPOLATED = (
+_MEASURES = [
     "score",
     "confidence",
     "age",
@@ -24,8 +24,7 @@ _INTERPOLATED = (
     "distance_std_m",
     "speed_mps",
     "speed_std_mps",
-)
-
+]
 _MIN_DISTANCE = 1.0  # of a vehicle that moves on after its last detection (m)
 _MIN_SEARCH_RATE = 12.0  # searches per second of a video, at least
 
@@ -43,26 +42,17 @@ def search_delay(params: TrackParams, fps: float, interval: int) -> int:
 def interpolate_results(
     before: FrameResult, after: FrameResult | None, times: Sequence[float], shape: tuple[int, ...]
 ) -> list[FrameResult]:
-    """Return the results of the frames between two searched frames, with interpolated tracks.
+    """Return the results of the frames at `times` between two searched frames, with interpolated tracks.
 
-    Parameters
-    ----------
-    before, after
-        Results of the searched frames, with times; `after` is None at the end of a video.
-    times
-        Times in seconds of the frames between.
-    shape
-        ``(height, width, ...)`` of the frames.
+    `before` and `after` have times; `after` is None at the end of a video.
     """
-    results = []
+    end = before.time if after is None else after.time
+    if before.time is None or end is None:
+        raise InvalidInputError("before and after must have times; pass time= to track")
+    results, following = [], () if after is None else after.tracks
     for number, time in enumerate(times):
         start = clock.perf_counter()
-        if before.time is None or (after is not None and after.time is None):
-            raise InvalidInputError("before and after must have times; pass time= to track")
-        dt_after, following = 0.0, tuple[Track, ...]()
-        if after is not None and after.time is not None:
-            dt_after, following = after.time - time, after.tracks
-        tracks = interpolate_tracks(before.tracks, following, time - before.time, dt_after, shape)
+        tracks = interpolate_tracks(before.tracks, following, time - before.time, end - time, shape)
         results.append(FrameResult.unsearched(before.index + 1 + number, time, tracks, start))
     return results
 
@@ -80,10 +70,10 @@ def interpolate_tracks(
 ) -> tuple[Track, ...]:
     """Estimate the tracks of a frame between two frames by linear interpolation, confirmed ones first.
 
-    The frame is `dt` seconds after the tracks `before` and `dt_after` seconds before the tracks `after`;
-    `shape` is its ``(height, width, ...)``. A track that has ended in `after`, or that was not confirmed yet
-    in `before`, moves at its velocity and speed, unless it is outside the frame. Tentative tracks are
-    included, so that their vehicles can be blurred.
+    The frame is `dt` seconds after the tracks `before` and `dt_after` seconds before the tracks `after`. A
+    track that has ended in `after`, or that was not confirmed yet in `before`, moves at its velocity and
+    speed, unless it is outside the frame. Tentative tracks are included, so that their vehicles can be
+    blurred.
     """
     confirmed = {track.key for track in after if track.id}
     following = {_identity(track): track for track in after}
@@ -105,23 +95,17 @@ def _identity(track: Track) -> tuple[int, int]:
 
 
 def backfill_tracks(earlier: Sequence[Track], later: Sequence[Track]) -> tuple[Track, ...]:
-    """Confirm the tentative tracks of an earlier frame that are confirmed in a later one.
+    """Confirm and show the tentative tracks of an earlier frame that are confirmed in a later one.
 
-    They get the id, the score and the confidence that they have there, and are shown.
+    They get the id, the score and the confidence that they have there.
     """
     confirmed = {track.key: track for track in later if track.id and track.key}
     found = []
     for track in earlier:
         other = None if track.id else confirmed.get(track.key)
         if other is not None:
-            track = replace(
-                track,
-                id=other.id,
-                score=other.score,
-                confidence=other.confidence,
-                state="coasting" if track.misses else "confirmed",
-                shown=True,
-            )
+            values: Any = {name: getattr(other, name) for name in ("id", "score", "confidence")}
+            track = replace(track, state="coasting" if track.misses else "confirmed", shown=True, **values)
         found.append(track)
     # Confirmed tracks by id, then tentative ones.
     return tuple(sorted(found, key=lambda track: track.id or math.inf))
@@ -131,7 +115,7 @@ def _mean(first: Track, second: Track, dt: float, dt_after: float) -> Track:
     """Interpolate between two states of a track."""
     fraction = dt / (dt + dt_after)
     values: dict[str, Any] = {"box": _read_only(first.box + fraction * (second.box - first.box))}
-    for name in _INTERPOLATED:
+    for name in _INTERPOLATED + _MEASURED:
         a, b = getattr(first, name), getattr(second, name)
         if a is not None and b is not None:
             values[name] = (1 - fraction) * a + fraction * b

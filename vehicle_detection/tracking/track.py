@@ -38,8 +38,7 @@ class TrackParams(Checked):
         `max_distance` and at an IoU of at least 0.5 (as in ByteTrack). Lower ones are dropped.
     confirm_score
         Average score at which a track is confirmed. A vehicle with constant score `s` reaches it after
-        ``score_time_constant * log(s / (s - confirm_score))`` seconds, and never if `s` is lower. Both
-        shipped models detect vehicles in single images from score 0 on.
+        ``score_time_constant * log(s / (s - confirm_score))`` seconds, and never if `s` is lower.
     confirm_hits, confirm_seconds
         Minimum number of detections beyond the number of frames without one, and minimum time since the first
         one, before a track is confirmed.
@@ -120,8 +119,9 @@ class Track:
 
     Attributes
     ----------
-    id
-        Number of the vehicle, from 1 in order of confirmation; 0 while the track is tentative.
+    id, key
+        Number of the vehicle, from 1 in order of confirmation, 0 while the track is tentative; and number of
+        the track from its first detection on, from 1, which tracks that are never confirmed have, too.
     box, velocity
         ``(4,)`` box inside the frame, read-only, and velocity of its center in pixels per second.
     score
@@ -134,9 +134,6 @@ class Track:
         (confirmed, but not detected in this frame: the box is a prediction); whether to draw the track.
     age, misses, time_since_update
         Seconds since the first detection, and frames and seconds since the last.
-    key
-        Number of the track from its first detection on, from 1; unlike `id` it is set while the track is
-        tentative, and tracks that are never confirmed have one.
     distance_m, distance_std_m, speed_mps, speed_std_mps
         Distance along the road in meters, and speed relative to the camera in meters per second, positive
         when moving away, with their standard errors; None where they are unknown.
@@ -165,16 +162,11 @@ class FrameResult:
 
     Attributes
     ----------
-    index
-        Number of the frame since the last reset, from 0.
-    time
-        Time of the frame in seconds; None if unknown.
-    windows
-        Positive windows of this frame.
-    detections
-        Boxes of this frame, before tracking.
-    tracks
-        All tracks; those with ``track.shown`` are vehicles to draw.
+    index, time
+        Number of the frame since the last reset, from 0, and its time in seconds, None if unknown.
+    windows, detections, tracks
+        Positive windows and boxes of this frame, before tracking; and all tracks, of which those with
+        ``track.shown`` are vehicles to draw.
     seconds
         Time spent per stage: ``"search"``, ``"regions"``, ``"track"``.
     searched
@@ -266,12 +258,10 @@ class TrackState:
         """Whether to draw it."""
         if not self.id or self.lost:
             return False
-        if not self.misses:
-            return True
-        if self.hidden:  # shown for as long as it was detected before
+        if self.misses and self.hidden:  # shown for as long as it was detected before
             long_enough = 2 * self.time_since_update < self.age + TIME_TOLERANCE
             return long_enough and self.covered_budget > -TIME_TOLERANCE
-        return self.coast_budget > -TIME_TOLERANCE
+        return not self.misses or self.coast_budget > -TIME_TOLERANCE
 
     def update_score(self, score: float | None, dt: float, params: TrackParams) -> None:
         """Advance by a frame, with the score of the assigned detection, or None without one."""
@@ -304,13 +294,10 @@ class TrackState:
 
     def can_confirm(self, params: TrackParams) -> bool:
         """Whether a tentative track meets the conditions of confirmation in this frame."""
-        if self.id or self.misses:
-            return False
-        return self.confirm_at_birth or (
-            self.hits - self.all_misses >= params.confirm_hits
-            and self.age > params.confirm_seconds - TIME_TOLERANCE
-            and self.score >= params.confirm_score
-        )
+        hits = self.hits - self.all_misses >= params.confirm_hits
+        old = self.age > params.confirm_seconds - TIME_TOLERANCE
+        convincing = self.confirm_at_birth or (hits and old and self.score >= params.confirm_score)
+        return convincing and not self.id and not self.misses
 
     def is_expired(self, params: TrackParams) -> bool:
         """Whether it has had no detection for too long."""

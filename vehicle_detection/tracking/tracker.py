@@ -10,15 +10,19 @@ frame.
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 import math
+from dataclasses import replace
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
     Floats,
     check_bool,
+    check_image,
     check_integer,
     check_number,
     check_shape,
@@ -47,8 +51,8 @@ from vehicle_detection.tracking.kalman import (
     Measurements,
     coasted_distance,
     exit_times,
+    make_smoother,
 )
-from vehicle_detection.tracking.smoothers import make_smoother
 from vehicle_detection.tracking.track import TIME_TOLERANCE, Track, TrackParams, TrackState, weight_of
 
 # Visible fraction of a box below which its vehicle leaves the frame if it moves outwards, and below which it
@@ -67,6 +71,8 @@ _LOW_SCORE_IOU = 0.5
 _PART_GAP = 2.0
 # Seconds without a detection after which `max_distance` stops growing.
 _MAX_GAP = 2.0
+# Pixels that two consecutive frames are compared by, and mean absolute difference, 0-255, of a scene cut.
+_THUMBNAIL_SHAPE, _CUT_DIFFERENCE = (18, 32), 40.0
 
 
 class Tracker:
@@ -82,11 +88,6 @@ class Tracker:
     calibration
         Converts scores to the confidences of the tracks; by default scores are log-odds, and 0 is 50%. None
         leaves the confidences unknown.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is of the wrong type or out of range.
 
     Examples
     --------
@@ -106,12 +107,9 @@ class Tracker:
         camera: Camera | None = None,
         calibration: Platt | None = LOG_ODDS,
     ) -> None:
-        if params is not None:
-            check_type(params, "params", TrackParams, "pass TrackParams()")
-        if camera is not None:
-            check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
-        if calibration is not None:
-            check_type(calibration, "calibration", Platt, "calibrate_scores makes one")
+        check_type(params, "params", TrackParams | None, "pass TrackParams()")
+        check_type(camera, "camera", Camera | None, "pass Camera.for_frame(image.shape)")
+        check_type(calibration, "calibration", Platt | None, "calibrate_scores makes one")
         self._calibration = calibration
         self._frame_seconds = 1 / check_number(fps, "fps", above=0, high=1e6)
         self.params = params or TrackParams()
@@ -162,7 +160,7 @@ class Tracker:
         frames: int = 1,
         cut: bool = False,
     ) -> tuple[Track, ...]:
-        """Process the detections of the next frame and return all tracks, including those not shown.
+        """Process the detections of the next frame; return confirmed tracks by id, then tentative ones.
 
         Parameters
         ----------
@@ -172,19 +170,7 @@ class Tracker:
         time, frames
             Time of the frame in seconds, by default `frames` frames after the last. A frame with the same
             time as the last one changes nothing. An earlier time, a gap of more than ``params.max_gap`` and
-            another `shape` end all tracks.
-        cut
-            Whether the frame begins another scene (`SceneCuts`), which ends all tracks, too.
-
-        Returns
-        -------
-        tuple of Track
-            Confirmed tracks by id, then tentative ones.
-
-        Raises
-        ------
-        InvalidInputError
-            If an argument is malformed, or the camera was made for frames of another aspect ratio.
+            another `shape` end all tracks, as does `cut`, the beginning of another scene (`SceneCuts`).
         """
         if hasattr(detections, "xyxy"):
             detections = Detections.from_supervision(detections)
@@ -215,27 +201,11 @@ class Tracker:
     def predict(self, *, time: float | None = None, frames: int = 1) -> tuple[Track, ...]:
         """Estimate where the confirmed tracks will be, without changing the state of the tracker.
 
-        Parameters
-        ----------
-        time, frames
-            Time in seconds, not before the last frame; by default `frames` frames after it.
-
-        Returns
-        -------
-        tuple of Track
-            The tracks by id, as `update` would return them if nothing was detected: the state is
-            ``"coasting"``, and ages and misses have grown; score and ``shown`` are those of the last frame.
-            A track that has left the frame by then is left out. At the time of the last frame, its tracks.
-
-        Raises
-        ------
-        InvalidInputError
-            If `time` is not a number, or lies before the last frame.
-
-        Notes
-        -----
-        The Kalman filter predicts at constant speed on the road; the smoothers ``"history"`` and
-        ``"nearest"`` have no motion model and leave each box where it is.
+        `time` is in seconds, not before the last frame; by default `frames` frames after it. Returns the
+        tracks by id, as `update` would if nothing was detected: the state is ``"coasting"``, and ages and
+        misses have grown; score and ``shown`` are those of the last frame. A track that has left the frame by
+        then is left out. The smoothers ``"history"`` and ``"nearest"`` have no motion model and leave each
+        box where it is.
 
         Examples
         --------
@@ -257,18 +227,12 @@ class Tracker:
             return self._tracks[: len(confirmed)]
         coasting = np.array([self._live[row].misses > 0 for row in confirmed])
         states = self._smoother.predict(self._states.take(confirmed), coasting, dt)
-        tracks = self._snapshot(self._shape, predict_distances(states, dt, self.camera), dt)
-        return tuple(
-            dataclasses.replace(
-                track,
-                state="coasting",
-                age=track.age + dt,
-                misses=track.misses + 1,
-                time_since_update=track.time_since_update + dt,
-            )
-            for track, area in zip(tracks, box_areas(_clip(states.boxes(), self._shape)))
-            if area >= 1
-        )
+        tracks = []
+        for track in self._snapshot(self._shape, predict_distances(states, dt, self.camera), dt):
+            times: Any = {"age": track.age + dt, "time_since_update": track.time_since_update + dt}
+            if box_areas(track.box[None]) >= 1:
+                tracks.append(replace(track, state="coasting", misses=track.misses + 1, **times))
+        return tuple(tracks)
 
     def _advance(self, frame: FrameShape, time: float | None, frames: int) -> float:
         """Set the time of this frame and return the seconds since the last; end all tracks at a jump."""
@@ -298,24 +262,20 @@ class Tracker:
         unassigned[list(own.values())] = False
         rows = sorted(source)
         tracks, boxes = [self._live[row] for row in rows], boxes[[source[row] for row in rows]]
-        in_front = np.array([track.id > 0 and track.misses == 0 for track in self._live])
-        predicted = _clip(self._states.boxes(), frame)
+        in_front, predicted = self._in_front(), _clip(self._states.boxes(), frame)
         covered = nearer_cover(predicted, in_front)
         for track, fraction in zip(self._live, covered.tolist()):
             track.covered = fraction
         is_merged = [row in shared or row in merged for row in rows]
         # A low-score box of a vehicle may also cover the lamp post above it.
         low = scores < self.params.high_threshold
-        unsure = [self._live[row].id > 0 and low[source[row]] for row in rows]
+        unsure = [track.id > 0 and low[source[row]] for row, track in zip(rows, tracks)]
         hidden = hidden_edges(boxes, predicted, rows, in_front)
         measured = Measurements.from_boxes(boxes, frame, is_merged, self._lens, covered[rows], hidden, unsure)
         states = self._smoother.correct(self._states.take(rows), tracks, measured, dt)
-        self._states = self._states.put(rows, self._update_distances(states, measured, dt))
+        states = update_distances(states, measured, self.camera, dt, self.params.measurement_correlation_time)
+        self._states = self._states.put(rows, states)
         return unassigned
-
-    def _update_distances(self, states: KalmanStates, measured: Measurements, dt: float) -> KalmanStates:
-        """Correct the distances of tracks by a measurement each."""
-        return update_distances(states, measured, self.camera, dt, self.params.measurement_correlation_time)
 
     def _assign(
         self, boxes: Floats, scores: Floats, frame: FrameShape
@@ -343,15 +303,13 @@ class Tracker:
         for row, column in match(predicted[rows], boxes[high:], near, _LOW_SCORE_IOU):
             own[rows[row]] = high + column
         # 3. Tentative tracks with all remaining detections.
-        taken = set(own.values())
-        columns = [column for column in range(len(boxes)) if column not in taken]
+        columns = sorted({*range(len(boxes))} - {*own.values()})
         for row, column in match(predicted[confirmed:], boxes[columns], max_distance[confirmed:]):
             own[confirmed + row] = columns[column]
         # 4. Tentative tracks, whose speed is not known, with sure detections of approaching vehicles. Unsure
         # ones may be of what stands beside the road, which comes nearer, too.
-        taken = set(own.values())
         sure = int((scores >= params.instant_confirm_score).sum())
-        columns = [column for column in range(sure) if column not in taken]
+        columns = sorted({*range(sure)} - {*own.values()})
         rows = [row for row in range(confirmed, len(self._live)) if row not in own]
         focus = frame[1] / 2, self.camera.horizon_px
         for row, column in match_approaching(predicted[rows], boxes[columns], focus, frame):
@@ -382,17 +340,15 @@ class Tracker:
             return
         scores = np.array([track.score for track in self._live])
         detected = np.array([track.misses == 0 for track in self._live])
-        is_whole = np.array([track.id > 0 for track in self._live]) & detected
-        better = is_whole[:, None] & (scores[:, None] > scores + _PART_GAP)
+        better = self._in_front()[:, None] & (scores[:, None] > scores + _PART_GAP)
         ended = detected & (better & on_one_vehicle(_clip(self._states.boxes(), frame))).any(axis=0)
         if ended.any():
             self._keep(np.flatnonzero(~ended).tolist())
 
     def _mark_missed(self, whole: Floats, inside: Floats, dt: float) -> None:
         """Account for missing detections, given the boxes of all tracks and their parts inside the frame."""
-        in_front = np.array([track.id > 0 and track.misses == 0 for track in self._live])
         nearer = whole[None, :, 3] > whole[:, None, 3]
-        fractions = np.where(nearer & in_front, covered_fractions(inside, inside), 0.0).max(axis=1)
+        fractions = np.where(nearer & self._in_front(), covered_fractions(inside, inside), 0.0).max(axis=1)
         gap = np.array([track.time_since_update for track in self._live])
         lost = coasted_distance(self._states.mean, gap) > _MAX_COAST_DISTANCE
         lost |= gap > self.params.max_coast + TIME_TOLERANCE
@@ -400,6 +356,10 @@ class Tracker:
             if track.misses:
                 is_merged, covered = track.hidden, fraction > _COVERED and not track.hidden
                 track.mark_missed(dt, hidden=is_merged or fraction > _HIDDEN, covered=covered, lost=is_lost)
+
+    def _in_front(self) -> NDArray[np.bool_]:
+        """Return which tracks are confirmed and detected in this frame, and so may hide others."""
+        return np.array([track.id > 0 and track.misses == 0 for track in self._live], np.bool_)
 
     def _keep(self, rows: list[int]) -> None:
         """Keep these tracks, in this order."""
@@ -414,12 +374,12 @@ class Tracker:
         rows = distinct_vehicles(boxes, range(high), known, self.params) if high else []
         if not rows:
             return
-        in_front = np.array([track.id > 0 and track.misses == 0 for track in self._live], np.bool_)
         tracked = _clip(self._states.boxes(), frame)
-        hidden = hidden_edges(boxes[rows], tracked, [-1] * len(rows), in_front)
+        hidden = hidden_edges(boxes[rows], tracked, [-1] * len(rows), self._in_front())
         measured = Measurements.from_boxes(boxes[rows], frame, camera=self._lens, hidden=hidden)
         states = initiate_states(*self._smoother.initiate(measured), self.camera)
-        self._states = self._states.join(self._update_distances(states, measured, dt))
+        correlation = self.params.measurement_correlation_time
+        self._states = self._states.join(update_distances(states, measured, self.camera, dt, correlation))
         weight = weight_of(dt, self.params)
         for score in scores[rows].tolist():
             confirm_at_birth = self._at_start and score >= self.params.instant_confirm_score
@@ -443,9 +403,7 @@ class Tracker:
     def _update_horizon(self, frame: FrameShape, dt: float) -> None:
         """Update the horizon from confirmed tracks that are fully visible in this frame."""
         boxes, ids = self._states.boxes(), np.array([track.id for track in self._live], np.int64)
-        visible = np.array(
-            [track.id > 0 and track.misses == 0 and track.covered == 0 for track in self._live], np.bool_
-        )
+        visible = self._in_front() & np.array([track.covered == 0 for track in self._live], np.bool_)
         visible &= ~truncated_edges(boxes, frame).any(axis=1)
         road_boxes = boxes[visible]
         if self._lens is not None:
@@ -454,28 +412,21 @@ class Tracker:
 
     def _snapshot(self, frame: FrameShape, states: KalmanStates, dt: float = 0.0) -> tuple[Track, ...]:
         """Return the first tracks, whose states have been predicted by `dt` seconds."""
-        boxes = _clip(states.boxes(), frame)
+        boxes, live = _clip(states.boxes(), frame), self._live[: len(states.mean)]
         boxes.setflags(write=False)
-        gap = np.array([track.time_since_update + dt for track in self._live[: len(boxes)]])
-        ranges = estimate_distances(states, gap, self.camera)
-        velocities = states.mean[:, 4:6].tolist()
-        scores = np.array([track.mean_score for track in self._live[: len(boxes)]])
-        confidences = [None] * len(scores)
+        gap = np.array([track.time_since_update + dt for track in live])
+        confidences = [None] * len(live)
         if self._calibration is not None:
+            scores = np.array([track.mean_score for track in live])
             confidences = self._calibration.probability(scores).tolist()
-        fields = ("id", "key", "score", "state", "shown", "age", "misses", "time_since_update")
-        return tuple(
-            Track(
-                box=box,
-                velocity=tuple(velocity),
-                confidence=confidence,
-                **estimate,
-                **{name: getattr(track, name) for name in fields},
-            )
-            for track, box, velocity, confidence, estimate in zip(
-                self._live, boxes, velocities, confidences, ranges
-            )
-        )
+        velocities = map(tuple, states.mean[:, 4:6].tolist())
+        ranges = estimate_distances(states, gap, self.camera)
+        names = ("id", "key", "score", "state", "shown", "age", "misses", "time_since_update")
+        tracks = []
+        for track, box, velocity, confidence, estimate in zip(live, boxes, velocities, confidences, ranges):
+            life = {name: getattr(track, name) for name in names}
+            tracks.append(Track(box=box, velocity=velocity, confidence=confidence, **estimate, **life))
+        return tuple(tracks)
 
 
 def _sorted_inside(detections: Detections, frame: FrameShape) -> tuple[Floats, Floats]:
@@ -489,3 +440,34 @@ def _sorted_inside(detections: Detections, frame: FrameShape) -> tuple[Floats, F
 def _clip(boxes: Floats, frame: FrameShape) -> Floats:
     height, width = frame
     return np.minimum(np.maximum(boxes, 0.0), np.array([width, height, width, height], np.float64))
+
+
+class SceneCuts:
+    """Finds the frames with which a new scene begins, given the frames of a video in their order.
+
+    Examples
+    --------
+    >>> cuts, dark = SceneCuts(), np.zeros((90, 160, 3), np.uint8)
+    >>> [cuts.update(frame) for frame in (dark, dark + 20, dark + 200, dark + 210)]
+    [False, False, True, False]
+    """
+
+    def __init__(self) -> None:
+        self._last: NDArray[np.float32] | None = None
+
+    def update(self, frame: NDArray[np.uint8]) -> bool:
+        """Whether the next ``(H, W, 3)`` frame, of any size, belongs to another scene than the one before."""
+        check_image(frame, "frame")
+        # The gray values of some pixels are enough, and take no time.
+        thumbnail = frame[_thumbnail_pixels(frame.shape[:2])].mean(axis=2, dtype=np.float32)
+        last, self._last = self._last, thumbnail
+        if last is None:
+            return False
+        return bool(cv2.norm(last, thumbnail, cv2.NORM_L1) > _CUT_DIFFERENCE * thumbnail.size)
+
+
+@functools.lru_cache(8)
+def _thumbnail_pixels(shape: tuple[int, ...]) -> tuple[NDArray[np.intp], ...]:
+    """Rows and columns of the pixels of a thumbnail."""
+    sides = zip(shape, _THUMBNAIL_SHAPE)
+    return np.ix_(*(np.linspace(0, side - 1, count).astype(np.intp) for side, count in sides))
