@@ -179,11 +179,11 @@ def _pixels_by_class(images: object, labels: ArrayLike | None) -> list[tuple[str
     known = style.check_numbers(labels, "labels", len(flat), "images")
     if known is None:
         return [(None, "0.35", np.concatenate(flat))]
-    groups: list[tuple[str | None, Any, Image]] = []
-    for name, color, mask in (("vehicle", VEHICLE, known > 0), ("other", OTHER, known <= 0)):
-        if mask.any():
-            groups.append((name, color, np.concatenate(list(itertools.compress(flat, mask)))))
-    return groups
+    return [
+        (name, color, np.concatenate(list(itertools.compress(flat, mask))))
+        for name, color, mask in (("vehicle", VEHICLE, known > 0), ("other", OTHER, known <= 0))
+        if mask.any()
+    ]
 
 
 def plot_hog(
@@ -213,8 +213,8 @@ def plot_hog(
     >>> len(plot_hog(patch, pix_per_cell=[8]).axes)
     6
     """
-    params = FeatureParams() if params is None else params
-    check_type(params, "params", FeatureParams, "omit it for the default")
+    check_type(params, "params", FeatureParams | None, "omit it for the default")
+    params = params or FeatureParams()
     single = isinstance(images, np.ndarray) and images.ndim == 3
     listed, names = style.split_titles([images] if single else images)
     sizes = style.check_list(pix_per_cell, "pix_per_cell", "cell sizes")

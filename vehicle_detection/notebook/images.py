@@ -56,9 +56,9 @@ def describe_image(image: NDArray[Any]) -> ImageDescription:
         raise InvalidInputError(
             f"image must be an array of numbers, got {describe(given)}; read a file with read_image"
         )
+    problem = ""
     try:
         check_image(image)
-        problem = ""
     except InvalidInputError as error:
         problem = str(error)
     mean = image.mean(axis=(0, 1) if image.ndim == 3 else None, dtype=np.float64)
@@ -141,15 +141,14 @@ def plot_methods(
     true = style.check_length(truth, "truth", len(listed), "images")
     for name, found in methods.items():
         style.check_length(found, f"methods[{name!r}]", len(listed), "images")
-    shown, titles, boxes = [], [], []
+    titles, panels = [], []
     for index, (image, row) in enumerate(zip(listed, rows)):
         check_image(image, f"images[{index}]")
         for name, found in methods.items():
             count = len(style.box_array(found[index], f"methods[{name!r}][{index}]"))
             titles.append(f"{'' if row is None else f'{row}, '}{name}: {pluralize(count, 'box', 'es')}")
-            shown.append(image)
-            boxes.append(found[index])
-    repeated = [each for each in true for _ in methods]
+            panels.append((image, found[index], true[index]))
+    shown, boxes, repeated = zip(*panels)
     return show_images(shown, titles, boxes=boxes, truth=repeated, columns=len(methods), figure=figure)
 
 
@@ -198,19 +197,16 @@ def plot_patches(
         raise InvalidInputError("patches must hold at least one patch; got none")
     tiles = []
     for row in rows:
-        lines = [texts[row]] if texts[row] else []
-        lines += [] if values is None else [f"score {values[row]:+.2f}"]
-        tiles.append((style.check_displayable(images[row], f"patches[{row}]"), "\n".join(lines)))
-    caption_lines = any(texts[row] for row in rows) + (values is not None)
+        score = "" if values is None else f"score {values[row]:+.2f}"
+        caption = "\n".join(filter(None, (texts[row], score)))
+        tiles.append((style.check_displayable(images[row], f"patches[{row}]"), caption))
+    lines = any(texts[row] for row in rows) + (values is not None)
     colors = None if classes is None else [VEHICLE if classes[row] else OTHER for row in rows]
-    axes, _ = style.add_tiles(
-        ax, tiles, columns=columns, inches=1.25, caption_lines=caption_lines, colors=colors
-    )
+    axes, _ = style.add_tiles(ax, tiles, columns=columns, inches=1.25, caption_lines=lines, colors=colors)
     if colors:
         handles = style.legend_lines(("vehicle", VEHICLE, "-"), ("other", OTHER, "-"))
-        axes.legend(
-            handles=handles, loc="lower right", bbox_to_anchor=(1, 1), ncols=2, fontsize=8, frameon=False
-        )
+        place: Any = {"loc": "lower right", "bbox_to_anchor": (1, 1), "ncols": 2}
+        axes.legend(handles=handles, **place, fontsize=8, frameon=False)
     return axes
 
 

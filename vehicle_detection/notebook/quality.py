@@ -133,9 +133,8 @@ def plot_precision_recall(
         used = np.flatnonzero(thresholds > limit)
         if len(used):
             axes.plot(recall[used[-1]], precision[used[-1]], "s", color=color, mfc="white", zorder=4)
-    axes.set(xlim=(0, 1.01), ylim=(0, 1.01), aspect="equal")
-    axes.set(xlabel="recall (fraction of vehicles found)")
-    axes.set(ylabel="precision (fraction of boxes that are correct)")
+    axes.set(xlim=(0, 1.01), ylim=(0, 1.01), aspect="equal", xlabel="recall (fraction of vehicles found)")
+    axes.set_ylabel("precision (fraction of boxes that are correct)")
     style.legend_above(axes, fontsize=8)
     return axes
 
@@ -412,16 +411,8 @@ def plot_parameter(
     groups = [(None, measured)] if by is None else measured.groupby(by, sort=False)
     for (name, rows), (color, dash) in zip(groups, style.line_styles()):
         runs = rows[quality].groupby(x[rows.index]).agg(["mean", "std"])
-        lines = axes.errorbar(
-            runs.index,
-            runs["mean"],
-            runs["std"],
-            fmt="o",
-            linestyle=dash,
-            color=color,
-            capsize=3,
-            markersize=4,
-        )
+        look: dict[str, Any] = {"fmt": "o", "linestyle": dash, "color": color, "capsize": 3, "markersize": 4}
+        lines = axes.errorbar(runs.index, runs["mean"], runs["std"], **look)
         lines.set_label(None if by is None else str(name))
     if not numeric:
         _name_ticks(axes, [str(name) for name in names])

@@ -96,8 +96,8 @@ def plot_bands(
     (3, '64x64 px, step 8x8, 3,825 windows')
     """
     height, width = check_image(image).shape[:2]
-    search = SearchParams.preset() if search is None else search
-    check_type(search, "search", SearchParams, "pass SearchParams.preset()")
+    check_type(search, "search", SearchParams | None, "pass SearchParams.preset()")
+    search = search or SearchParams.preset()
     bands = search.place(image.shape)
     columns = 2 if len(bands) in (2, 4) else min(len(bands), 3)
     rows = math.ceil(len(bands) / columns)
@@ -232,8 +232,8 @@ def plot_heatmap(
     """
     height, width = check_image(image).shape[:2]
     check_type(windows, "windows", Detections, "pass what find_cars returns, or Detections(boxes, scores)")
-    params = HeatParams() if params is None else params
-    check_type(params, "params", HeatParams, "pass HeatParams()")
+    check_type(params, "params", HeatParams | None, "pass HeatParams()")
+    params = params or HeatParams()
     heat = frame_heat(image.shape, windows, params) if heat is None else heat
     if np.shape(heat) != (height, width):
         raise InvalidInputError(

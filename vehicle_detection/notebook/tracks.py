@@ -100,8 +100,8 @@ def plot_tracks(
             panel.plot(time, values, color=color, linestyle=dash, linewidth=1.8, label=f"#{number}")
             if not np.isnan(stds).all():
                 panel.fill_between(time, values - stds, values + stds, color=color, alpha=0.25, linewidth=0)
+    check_type(truth, "truth", TrackTable | None, "read a file with read_labels or pass drive.labels")
     if truth is not None:
-        check_type(truth, "truth", TrackTable, "read a file with read_labels or pass drive.labels")
         true = _columns_by_track(truth[~truth["ignore"]], "truth", rate)
         for index, (time, *columns) in enumerate(true.values()):
             for panel, values in zip(grid.flat, columns):
@@ -255,10 +255,8 @@ def plot_birds_eye(
     rate = check_number(fps, "fps", above=0, high=1e6)
     seconds = check_number(trail_seconds, "trail_seconds", low=0)
     frame = check_shape(shape)
-    if camera is None:
-        camera = Camera.for_frame(frame)
-    check_type(camera, "camera", Camera, "pass a Camera, or None for a typical dash-cam")
-    camera = camera.for_shape(frame)
+    check_type(camera, "camera", Camera | None, "pass a Camera, or None for a typical dash-cam")
+    camera = (camera or Camera.for_frame(frame)).for_shape(frame)
 
     axes = style.new_axes(ax, 4.5, 7.0)
     last = listed[-1]

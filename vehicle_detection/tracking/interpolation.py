@@ -15,16 +15,8 @@ from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tracking.track import TIME_TOLERANCE, FrameResult, Track, TrackParams
 
-_MEASURES = [
-    "score",
-    "confidence",
-    "age",
-    "time_since_update",
-    "distance_m",
-    "distance_std_m",
-    "speed_mps",
-    "speed_std_mps",
-]
+_INTERPOLATED = ("score", "confidence", "age", "time_since_update")
+_MEASURED = ("distance_m", "distance_std_m", "speed_mps", "speed_std_mps")
 _MIN_DISTANCE = 1.0  # of a vehicle that moves on after its last detection (m)
 _MIN_SEARCH_RATE = 12.0  # searches per second of a video, at least
 
