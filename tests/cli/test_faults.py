@@ -22,7 +22,7 @@ from vehicle_detection import detector, drive, tables, video
 from vehicle_detection._common import files
 from vehicle_detection._kernels.jit import jit
 from vehicle_detection.cli.signals import raise_on_signals
-from vehicle_detection.drive import event_files, events
+from vehicle_detection.drive import events
 from vehicle_detection.errors import OutputError
 from vehicle_detection.formats import write
 from vehicle_detection.images import write_image
@@ -229,14 +229,14 @@ def test_an_interrupt_while_clips_are_cut_keeps_all_other_files(clip, tmp_path, 
         for number, kind in enumerate(kinds)
     )
     monkeypatch.setattr(drive, "find_events", lambda *_, **__: found)
-    cut = event_files.cut_video
+    cut = events.cut_video
 
     def interrupt(source, target, **options):
         if "closing" in target.name:
             raise KeyboardInterrupt
         return cut(source, target, **options)
 
-    monkeypatch.setattr(event_files, "cut_video", interrupt)
+    monkeypatch.setattr(events, "cut_video", interrupt)
     outputs = {"-o": "o.mp4", "--tracks": "o.csv", "--report": "o.html", "--events": "o.json"}
     outputs["--srt"] = "o.srt"
     words = [word for option, name in outputs.items() for word in (option, tmp_path / name)]

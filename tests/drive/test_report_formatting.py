@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_detection.drive.report_formatting import format_time
+from vehicle_detection.drive.report_charts import format_time
 
 
 @given(st.floats(0, 1e5))

@@ -20,11 +20,8 @@ from vehicle_detection._common.checks import (
     describe,
     is_listing,
     shorten,
-    store_integer,
     store_number,
 )
-from vehicle_detection._common.closing import Closing
-from vehicle_detection._common.environment import check_environment
 from vehicle_detection._common.fields import Checked, checked_field, choice, flag, integer, number
 from vehicle_detection._common.files import (
     atomic_write,
@@ -34,14 +31,23 @@ from vehicle_detection._common.files import (
     temporary_folder,
     write_text,
 )
-from vehicle_detection._common.limits import Limit, check_regular_file, read_regular_file
+from vehicle_detection._common.limits import Limit, check_environment, check_regular_file, read_regular_file
 from vehicle_detection._common.model_file import FORMAT_VERSION, read_model, write_model
 from vehicle_detection._common.parquet import import_pyarrow, open_parquet
 from vehicle_detection._common.progress import in_notebook, progress_bar
 from vehicle_detection._common.signals import postpone
-from vehicle_detection._common.text import encodable, natural_key, pluralize
+from vehicle_detection._common.text import (
+    encodable,
+    hide_credentials,
+    is_url,
+    local_path,
+    natural_key,
+    pluralize,
+    stable_url,
+)
 from vehicle_detection._common.threads import (
     JOBS_VARIABLE,
+    Closing,
     ThreadTeam,
     available_cores,
     call_in_thread,
@@ -49,78 +55,6 @@ from vehicle_detection._common.threads import (
     single_threaded_opencv,
 )
 from vehicle_detection._common.units import ROUGH_DISTANCE, UNITS, Units, format_with_error
-from vehicle_detection._common.urls import hide_credentials, is_url, local_path, stable_url
 from vehicle_detection._common.workspace import NEW_ARRAYS, SPARE, Workspace, with_spare
 
 check_environment()
-
-__all__ = [
-    "FORMAT_VERSION",
-    "JOBS_VARIABLE",
-    "NEW_ARRAYS",
-    "ROUGH_DISTANCE",
-    "SPARE",
-    "UNITS",
-    "Checked",
-    "Closing",
-    "Floats",
-    "Limit",
-    "ThreadTeam",
-    "Units",
-    "Workspace",
-    "atomic_write",
-    "available_cores",
-    "blur_patches",
-    "call_in_thread",
-    "check_array",
-    "check_bool",
-    "check_boxes",
-    "check_channel",
-    "check_choice",
-    "check_flags",
-    "check_image",
-    "check_integer",
-    "check_number",
-    "check_patches",
-    "check_path",
-    "check_regular_file",
-    "check_sequence",
-    "check_shape",
-    "check_suffix",
-    "check_target",
-    "check_type",
-    "checked_field",
-    "choice",
-    "degrade_patches",
-    "describe",
-    "encodable",
-    "flag",
-    "format_with_error",
-    "hide_credentials",
-    "import_pyarrow",
-    "in_notebook",
-    "integer",
-    "is_hidden",
-    "is_listing",
-    "is_url",
-    "local_path",
-    "mirror_patches",
-    "natural_key",
-    "number",
-    "open_parquet",
-    "pluralize",
-    "postpone",
-    "progress_bar",
-    "read_model",
-    "read_regular_file",
-    "resolve_jobs",
-    "shorten",
-    "single_threaded_opencv",
-    "stable_url",
-    "store_integer",
-    "store_number",
-    "temporary_folder",
-    "with_spare",
-    "write_model",
-    "write_text",
-]

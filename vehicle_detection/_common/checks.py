@@ -17,9 +17,8 @@ from vehicle_detection.errors import InvalidInputError
 
 Floats = NDArray[np.float64]
 
+# Integers up to it are exact in every format; no count of anything is larger.
 _MAX_INTEGER = 2**53
-"""Integers up to it are exact in every format; no count of anything is larger."""
-
 # Bytes of a path, and of each name in it: the limits of Linux, not lower than those of other systems.
 _MAX_PATH, _MAX_NAME = 4096, 255
 
@@ -263,11 +262,6 @@ def store_number(instance: object, name: str, **bounds: float) -> None:
     number = check_number(value, name, **bounds)
     if type(value) not in (int, float):
         object.__setattr__(instance, name, number)
-
-
-def store_integer(instance: object, name: str, *, low: int, high: int | None = None) -> None:
-    """Check an attribute of a dataclass; an integer of NumPy becomes an int."""
-    object.__setattr__(instance, name, check_integer(getattr(instance, name), name, low=low, high=high))
 
 
 def check_integer(value: object, name: str, *, low: int, high: int | None = None) -> int:

@@ -23,7 +23,6 @@ _FULL = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
 _DISK_ERRORS = (*_FULL, errno.EROFS, errno.EIO)
 # Processes that write one target at the same time, above which their leftovers are not removed.
 _MAX_PARTS = 100
-
 _SYSTEM_FOLDERS = ("__macosx", "$recycle.bin", "system volume information", "lost+found")
 
 
@@ -70,12 +69,8 @@ def atomic_write(target: str | os.PathLike[str], name: str = "target") -> Iterat
 
     After an error or an interrupt, the temporary file is removed and an existing `target` is unchanged. That
     of a killed process is used, and thereby removed, by the next one with the same target. The temporary name
-    has the suffix of `target`, which determines the format that many libraries write.
-
-    Raises
-    ------
-    OutputError
-        If the disk is full, or the target cannot be written for another reason.
+    has the suffix of `target`, which determines the format that many libraries write. A full disk and other
+    errors of the system are an `OutputError`.
     """
     path = check_target(target, name)
     if path.is_symlink() and path.exists():  # the link stays one
@@ -152,11 +147,8 @@ def _output_errors(path: Path, part: Path | None = None, *, every: bool = False)
     except VehicleDetectionError:
         raise
     except OSError as error:
-        concerned = error.errno in _DISK_ERRORS and str(part) in (
-            error.filename or str(part),
-            error.filename2,
-        )
-        if not every and not concerned:
+        named = error.filename or str(part), error.filename2
+        if not every and (error.errno not in _DISK_ERRORS or str(part) not in named):
             raise
         kept = "; the existing file is unchanged" if path.is_file() else ""
         reason = error.strerror or str(error) or type(error).__name__

@@ -1,8 +1,60 @@
-"""Text of counts and names."""
+"""Text of counts, names and URLs: messages show URLs without their passwords and signatures."""
 
 from __future__ import annotations
 
 import re
+from urllib.parse import unquote_plus
+
+_URL = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://")
+_FILE_URL = re.compile("file://(localhost(?=/))?", re.IGNORECASE)
+# A password may hold an "@": the host begins after the last one.
+_CREDENTIALS = re.compile(r"(?<=://)[^\s/?#]*@")
+_PASSWORD = re.compile(r"(?<=://)([^\s/?#:@]*):[^\s/?#]*@")
+# Parameters of queries that are secret; punctuation after a value belongs to the sentence.
+_SECRET = re.compile(
+    r"(?<=[?&])([\w.-]*(?:signature|token|credential|secret|passw|api[_-]?key|access[_-]?key)[\w.-]*"
+    r"|sig|key|key-pair-id|policy|pass|pwd|jwt|auth(?:orization|key)?)=[^\s&#'\"<>]*[^\s&#'\"<>).,:;]",
+    re.IGNORECASE,
+)
+# Parameters of URLs signed by S3, Google, CloudFront or Azure; a token may instead be what names a file.
+_SIGNATURE = re.compile(
+    r"x-(amz|goog)-.*|awsaccesskeyid|googleaccessid|expires|signature|key-pair-id|policy", re.IGNORECASE
+)
+_AZURE = re.compile(r"sig|s[eprstv]|srt|spr|sip|sdd|sk(oid|tid|[estv])|saoid|suoid|scid", re.IGNORECASE)
+
+
+def is_url(text: str) -> bool:
+    """Whether a text is a URL rather than a path."""
+    return _URL.match(text) is not None
+
+
+def local_path(text: str) -> str:
+    """Return the path of a ``file://`` URL, and any other text as it is."""
+    scheme = _FILE_URL.match(text)
+    if scheme is None:
+        return text
+    from urllib.request import url2pathname  # takes tens of milliseconds
+
+    return url2pathname(text[scheme.end() :])
+
+
+def hide_credentials(text: str) -> str:
+    """Replace the user, the password, and signatures and tokens in the query of each URL by ``***``."""
+    return _SECRET.sub(r"\1=***", _CREDENTIALS.sub("***@", text))
+
+
+def stable_url(url: str) -> str:
+    """Return a URL without its password and without the parameters of a signature, which are renewed."""
+    url = _PASSWORD.sub(r"\1@", url)
+    head, mark, rest = url.partition("?")
+    if not mark:
+        return url
+    query, mark, fragment = rest.partition("#")
+    named = [(unquote_plus(pair.partition("=")[0]), pair) for pair in query.split("&")]
+    if any(name.lower() == "sig" for name, _ in named):
+        named = [(name, pair) for name, pair in named if not _AZURE.fullmatch(name)]
+    kept = "&".join(pair for name, pair in named if not _SIGNATURE.fullmatch(name))
+    return head + (f"?{kept}" if kept else "") + mark + fragment
 
 
 def pluralize(count: int, noun: str, ending: str = "s") -> str:

@@ -1,4 +1,4 @@
-"""Threads: their number, a team that shares work, and OpenCV without threads of its own."""
+"""Threads: their number, a team that shares work, and OpenCV without threads; what a block closes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import cv2
 
@@ -139,7 +139,21 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=single_threaded_opencv.__init__)  # type: ignore[misc]
 
 
-class ThreadTeam:
+class Closing:
+    """Base of objects whose `close` a ``with`` block calls."""
+
+    def close(self) -> None:
+        """Release everything."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class ThreadTeam(Closing):
     """`jobs` threads, including the calling one, that process a list of items; kept for the next list."""
 
     def __init__(self, jobs: int | None = None, *, name: str) -> None:

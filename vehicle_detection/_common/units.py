@@ -20,7 +20,7 @@ def format_with_error(value: float, error: float | None, *, signed: bool = False
     return text if error is None else f"{text} ± {max(error, 0.1):.{digits}f}"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Units:
     """A unit of distance and one of speed: factors from meters and meters per second, symbols and names."""
 
@@ -32,13 +32,7 @@ class Units:
     speed_name: str
 
     def distance_text(self, meters: float, std_m: float | None, *, with_std: bool = False) -> str:
-        """Format a distance, such as "17 m"; "~17 m" if its error exceeds 20%, "17 ± 3 m" with the error.
-
-        >>> UNITS["metric"].distance_text(17.3, 4.0)
-        '~17 m'
-        >>> UNITS["imperial"].distance_text(17.3, 2.0, with_std=True)
-        '57 ± 7 ft'
-        """
+        """Format a distance, such as "17 m"; "~17 m" if its error exceeds 20%, "17 ± 3 m" with the error."""
         value, symbol = self.distance * meters, self.distance_symbol
         if with_std and std_m is not None:
             return f"{format_with_error(value, self.distance * std_m)} {symbol}"
@@ -57,21 +51,7 @@ class Units:
 
 
 UNITS = {
-    "metric": Units(
-        distance=1.0,
-        distance_symbol="m",
-        distance_name="meters",
-        speed=3.6,
-        speed_symbol="km/h",
-        speed_name="kilometers per hour",
-    ),
-    "imperial": Units(
-        distance=1 / 0.3048,
-        distance_symbol="ft",
-        distance_name="feet",
-        speed=3600 / 1609.344,
-        speed_symbol="mph",
-        speed_name="miles per hour",
-    ),
+    "metric": Units(1.0, "m", "meters", 3.6, "km/h", "kilometers per hour"),
+    "imperial": Units(1 / 0.3048, "ft", "feet", 3600 / 1609.344, "mph", "miles per hour"),
 }
 """Systems of units by name."""

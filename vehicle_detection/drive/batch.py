@@ -32,6 +32,7 @@ from vehicle_detection._common import (
     progress_bar,
 )
 from vehicle_detection.drive.batch_plan import (
+    Facts,
     fingerprint_of,
     group_files,
     list_videos,
@@ -42,6 +43,7 @@ from vehicle_detection.drive.batch_plan import (
     trip_id,
 )
 from vehicle_detection.drive.batch_records import (
+    COUNTS,
     DONE,
     ERROR,
     FAILED,
@@ -81,16 +83,13 @@ class BatchReport:
     trips
         Number of trips of the sources (of this shard).
     done, failed, errors
-        Number of trips that this run processed, whose source cannot be processed, and that the next run
-        repeats.
+        Numbers of trips that were processed, whose source is bad, and that the next run repeats.
     skipped
         Number of trips that an earlier or another run completed or found to have failed.
-    frames
-        Number of frames that this run processed.
-    seconds
-        Elapsed time.
+    frames, seconds
+        Number of frames that this run processed, and elapsed time.
     messages
-        Message of each failed trip and each error of this run, by its first source.
+        Message of each failed trip and each error, by its first source.
     planned
         With `dry_run`, the trips that would be processed: ``files``, ``camera``, ``start`` and ``replaces``,
         the keys of earlier results that the new ones would replace; otherwise None.
@@ -161,36 +160,27 @@ def run_batch(
         Video files, folders, patterns and URLs. Consecutive segments are one trip, see `find_trips`. The
         annotated videos in `out` are left out.
     out
-        Folder to write, or a URL of storage that fsspec knows, such as ``"s3://bucket/results"``. Several
-        runs, also on several machines, may use one folder at the same time; at a URL, which has no locks, two
-        of them may both process a trip.
+        Folder, or a URL that fsspec knows, such as ``"s3://bucket/results"``. Several runs, also on several
+        machines, may share one; at a URL, which has no locks, two of them may both process a trip.
     executor
         A ``concurrent.futures`` executor, such as that of `open_dask`, whose workers see the same files.
         None: worker processes of this machine, which import the running script, so that a script calls this
         function below ``if __name__ == "__main__":``.
-    model
-        A model's name or file.
-    options
-        Options of the command ``batch`` for the detector as JSON values: classes, device, conf, camera, fov,
-        camera_height, horizon, every and blur, such as ``{"horizon": 0.55, "every": 2}``.
+    model, options
+        A model's name or file, and options of the command ``batch`` for the detector as JSON values: classes,
+        device, conf, camera, fov, camera_height, horizon, every and blur.
     jobs
         Number of worker processes with one thread each; None: one per core.
     shard
         ``"3/200"``: process the third of 200 parts, which depend on nothing but the paths.
     group
         ``"trip"`` or ``"file"``: make consecutive segments one trip, or each file.
-    tracks_only
-        Write no videos.
-    audio, preset
-        As in `process_video`.
-    retry_failed
-        Also process trips again whose source could not be processed.
-    dry_run
-        Only find out what is to be done: nothing is processed, written or removed.
-    progress
-        Show a progress bar in a terminal or a notebook.
-    on_record
-        Function that is called with the record of each trip when it is finished.
+    tracks_only, audio, preset
+        Write no videos; and as in `process_video`.
+    retry_failed, dry_run
+        Repeat also trips whose source could not be processed; only find out what is to be done.
+    progress, on_record
+        Show a progress bar in a terminal or a notebook; and call a function with each finished trip's record.
 
     Returns
     -------
@@ -199,8 +189,6 @@ def run_batch(
 
     Raises
     ------
-    InvalidInputError
-        If an argument is invalid, a source does not exist, or pyarrow is missing.
     TransientVideoError, OutputError
         If remote sources, or the storage of `out`, do not answer when the batch starts.
 
@@ -234,17 +222,14 @@ def run_batch(
     store = open_store(out, create=not dry_run, exists=not dry_run)
     tasks = _plan(listed, store, settings, group, part)
     pending, superseded = _pending(tasks, store, retry_failed)
-    skipped = len(tasks) - len(pending)
-    planned = None
+    counts = Counter(skipped=len(tasks) - len(pending))
+    planned, messages = None, {}
     if dry_run:
         names = ("files", "camera", "start", "replaces")
         planned = tuple({name: task[name] for name in names} for task in pending)
         pending, superseded, progress = [], [], False
     for task, record in superseded:
         remove_replaced(store, task, record)
-    counts = {DONE: 0, FAILED: 0, ERROR: 0}
-    frames = 0
-    messages: dict[str, str] = {}
     with contextlib.ExitStack() as stack:
         if executor is None and pending:
             warm = warm_up, (settings, fingerprint_of(settings))
@@ -252,22 +237,19 @@ def run_batch(
         bar = stack.enter_context(progress_bar(progress, len(pending), unit="trip", interactive_only=True))
         for made in stack.enter_context(contextlib.closing(_run(executor, pending, store))):
             bar.update()
+            counts[made["status"] if made["new"] else "skipped"] += 1
             if not made["new"]:
-                skipped += 1
                 continue
-            counts[made["status"]] += 1
-            frames += made.get("frames", 0)
+            counts["frames"] += made.get("frames", 0)
             if made["status"] != DONE:
                 messages[made["sources"][0]["uri"]] = made["message"]
             if on_record is not None:
                 on_record(made)
     return BatchReport(
+        **{name: counts[status] for name, status in COUNTS.items()},
         trips=len(tasks),
-        done=counts[DONE],
-        failed=counts[FAILED],
-        errors=counts[ERROR],
-        skipped=skipped,
-        frames=frames,
+        skipped=counts["skipped"],
+        frames=counts["frames"],
         seconds=time.perf_counter() - started,
         messages=messages,
         planned=planned,
@@ -295,7 +277,10 @@ def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -
     name = os.fspath(model)
     if not shipped_model(name).is_file() and Path(name).exists():
         name = os.path.abspath(name)
-    given = {name: _plain(value) for name, value in dict(options or {}).items()}
+    given = dict(options or {})
+    for key, value in given.items():  # a path or a number of NumPy
+        if isinstance(value, (os.PathLike, np.generic)):
+            given[key] = os.fspath(value) if isinstance(value, os.PathLike) else value.item()
     if os.path.isfile(str(given.get("camera"))):
         given["camera"] = os.path.abspath(given["camera"])
     settings = {"model": name, "options": given, **others}
@@ -315,19 +300,8 @@ def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -
     return settings
 
 
-def _plain(value: Any) -> Any:
-    """Return a path as text, and a number of NumPy as one of Python."""
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    return value.item() if isinstance(value, np.generic) else value
-
-
 def _plan(
-    listed: Mapping[str, Mapping[str, Any]],
-    store: Store,
-    settings: Mapping[str, Any],
-    group: str,
-    part: tuple[int, int],
+    listed: Mapping[str, Facts], store: Store, settings: Mapping[str, Any], group: str, part: tuple[int, int]
 ) -> list[dict[str, Any]]:
     """Describe the work on each trip of this shard."""
     files = [each for each in listed if not _is_result(each, store)]
@@ -386,16 +360,13 @@ def _longer_records(
 
 
 def _without_recorded(
-    trip: Trip,
-    plan: dict[str, Any],
-    record: Mapping[str, Any] | None,
-    listed: Mapping[str, Mapping[str, Any]],
+    trip: Trip, plan: dict[str, Any], record: Mapping[str, Any] | None, listed: Mapping[str, Facts]
 ) -> tuple[Trip, dict[str, Any]]:
     """Leave out the first files of a trip that a longer record holds, if it has the same parameters."""
     settings, fingerprint = plan["settings"], plan["fingerprint"]
-    if record is None:
-        return trip, plan
-    if record["key"].partition("-")[2] != trip_digest(record["sources"], settings, fingerprint):
+    if record is None or record["key"].partition("-")[2] != trip_digest(
+        record["sources"], settings, fingerprint
+    ):
         return trip, plan
     held = sum(1 for _ in takewhile(record["sources"].__contains__, plan["sources"]))
     if held == len(trip.files):
@@ -431,38 +402,31 @@ def _run(
     attempts: Counter[str] = Counter()
     running: dict[Future[Any], dict[str, Any]] = {}
     finished: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
-    busy: list[dict[str, Any]] = []
-
-    def submit(task: dict[str, Any]) -> None:
-        assert executor is not None
-        future = executor.submit(run_trip, task)
-        running[future] = task
-        future.add_done_callback(finished.put)
-
-    waiting = deque(pending)  # not submitted; what is left if the executor breaks has an error
+    waiting, busy = deque(pending), list[dict[str, Any]]()  # not submitted; processed by other runs
     try:
         while waiting or running or busy:
             while waiting:
-                submit(waiting[0])
-                waiting.popleft()
-            if not running:  # only trips that other runs are working on are left
+                assert executor is not None
+                future = executor.submit(run_trip, waiting[0])
+                running[future] = waiting.popleft()
+                future.add_done_callback(finished.put)
+            if not running:
                 time.sleep(_BUSY_INTERVAL)
                 waiting, busy = deque(busy), []
                 continue
             future = finished.get()
-            task = running.pop(future)
-            waiting.append(task)
+            task = running[future]
             record = _outcome(future, task, attempts, store)
+            del running[future]
             if record is None:
-                submit(task)
+                waiting.append(task)
             elif record["status"] == BUSY:
                 busy.append(task)
             else:
                 yield record
-            waiting.pop()
     except BrokenExecutor as error:  # such as a scheduler that was killed: the next run does the rest
         for task in (*waiting, *running.values(), *busy):
-            yield _basic_record(task, f"{error}") | {"new": True}
+            yield _error_record(task, f"{error}") | {"new": True}
     finally:
         for future in running:
             future.cancel()
@@ -474,17 +438,14 @@ def _outcome(
     """Record of a call that has ended; None to try again after it has lost its worker."""
     try:
         record: dict[str, Any] = future.result()
+        return record
     except BrokenExecutor:  # all other calls fail as well
         raise
     except Exception as error:
         attempts[task["key"]] += 1
-        return None if attempts[task["key"]] < _ATTEMPTS else _lost_record(task, error, store)
-    return record
-
-
-def _lost_record(task: Mapping[str, Any], error: Exception, store: Store) -> dict[str, Any]:
-    """Record a trip that has ended its worker in every attempt."""
-    record = _basic_record(task, hide_credentials(f"{error}, {_ATTEMPTS} times"))
+        if attempts[task["key"]] < _ATTEMPTS:
+            return None
+        record = _error_record(task, hide_credentials(f"{error}, {_ATTEMPTS} times"))
     try:
         write_record(store, record)
     except (OSError, InvalidInputError) as unwritten:
@@ -492,11 +453,7 @@ def _lost_record(task: Mapping[str, Any], error: Exception, store: Store) -> dic
     return record | {"new": True}
 
 
-def _basic_record(task: Mapping[str, Any], message: str) -> dict[str, Any]:
+def _error_record(task: Mapping[str, Any], message: str) -> dict[str, Any]:
     """Record of a trip without a result."""
-    return {
-        **{name: task[name] for name in RECORDED},
-        "status": ERROR,
-        "message": message,
-        "started": time.time(),
-    }
+    facts = {"status": ERROR, "message": message, "started": time.time()}
+    return {name: task[name] for name in RECORDED} | facts

@@ -27,19 +27,12 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.drive.trips import Trip, find_trips
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
-from vehicle_detection.video import (
-    is_video_file,
-    open_filesystem,
-    probe_video,
-    walk_files,
-    with_retries,
-)
+from vehicle_detection.video import is_video_file, open_filesystem, probe_video, walk_files, with_retries
 
 _ID_DIGITS = _HASH_DIGITS = 12
 _HTTP_TIMEOUT = 10
 # Answers to a HEAD request after which a GET may succeed, such as that of a URL signed for GET only.
 _NO_HEAD = (400, 401, 403, 405, 501)
-
 
 Facts = Mapping[str, Any]
 """What storage states about a file when it lists it, such as its size and entity tag; empty if unknown."""
@@ -156,7 +149,9 @@ def plan_trip(
     signatures.
     """
     files = [str(file) for file in trip.files]
-    sources = [{"uri": _shown(file), **_identify(file, known.get(file, {}))} for file in files]
+    shown = [hide_credentials(stable_url(file)) if is_url(file) else file for file in files]
+    facts = [_identify(file, known.get(file, {})) for file in files]
+    sources = [{"uri": uri, **each} for uri, each in zip(shown, facts)]
     return {
         "key": f"{trip_id(trip)}-{trip_digest(sources, settings, fingerprint)}",
         "files": files,
@@ -190,11 +185,6 @@ def shipped_model(model: str) -> Traversable:
     return resources.files("vehicle_detection") / "models" / f"{model}{suffix}"
 
 
-def _shown(uri: str) -> str:
-    """Path or URL of a file in its record: without what is secret, or is renewed with a signature."""
-    return hide_credentials(stable_url(uri)) if is_url(uri) else uri
-
-
 def _identify(uri: str, facts: Facts) -> dict[str, Any]:
     """Size of a file, and its modification time or entity tag; None and empty where it cannot be found."""
     try:
@@ -218,8 +208,8 @@ def _identify_http(url: str) -> dict[str, Any]:
     answer = requests.head(url, timeout=_HTTP_TIMEOUT, allow_redirects=True)
     if answer.status_code in _NO_HEAD:
         first_byte = {"Range": "bytes=0-0"}
-        with requests.get(url, timeout=_HTTP_TIMEOUT, headers=first_byte, stream=True) as answer:
-            pass
+        answer = requests.get(url, timeout=_HTTP_TIMEOUT, headers=first_byte, stream=True)
+        answer.close()
     if answer.status_code >= 500:
         answer.raise_for_status()
     if not answer.ok:

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     import pandas
 
 DONE, FAILED, ERROR = "done", "failed", "error"
+COUNTS = {"done": DONE, "failed": FAILED, "errors": ERROR}
+"""Status of the trips that `BatchReport` and `BatchStatus` count by these names."""
+
 _FOLDER = "records"
 _SUMMARY_COLUMNS = (
     "key", "status", "camera", "date", "start", "first_file", "files", "frames", "video_seconds", "tracks",
@@ -34,14 +37,12 @@ class BatchStatus:
 
     Attributes
     ----------
-    done, failed, errors
-        Number of trips that were processed, whose source cannot be processed, and that the next run repeats.
+    done, failed, errors, messages
+        As in the `BatchReport` of a run.
     frames, tracks
         Number of frames and of tracks of the processed trips.
     video_seconds, work_seconds
         Length of the processed trips, and the time that their workers took.
-    messages
-        Message of each failed trip and each error, by its first source.
 
     Examples
     --------
@@ -75,11 +76,7 @@ class BatchStatus:
 
 
 def with_source(source: str, message: str) -> str:
-    """Put the name of a source before a message that lacks it.
-
-    >>> with_source("a.mp4", "a.mp4 is incomplete"), with_source("a.mp4", "its worker was killed")
-    ('a.mp4 is incomplete', 'a.mp4: its worker was killed')
-    """
+    """Put the name of a source before a message that lacks it."""
     return message if " ".join(source.split()) in message else f"{source}: {message}"
 
 
@@ -94,9 +91,9 @@ def read_record(store: Store, key: str) -> dict[str, Any] | None:
     return None if data is None else _parse(data)
 
 
-def read_records(store: Store, keys: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Read the records of trips by their keys; those that are missing or damaged are left out."""
-    found = store.read_many(record_path(key) for key in keys)
+def read_records(store: Store, keys: Iterable[str] | None = None) -> dict[str, dict[str, Any]]:
+    """Read the records of trips, or of all, by their keys; missing or damaged ones are left out."""
+    found = store.read_many(record_path(key) for key in (record_keys(store) if keys is None else keys))
     parsed = ((_key(path), _parse(data)) for path, data in found)
     return {key: record for key, record in parsed if record is not None}
 
@@ -134,101 +131,51 @@ def record_keys(store: Store) -> list[str]:
 def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
     """Summarize the records of a batch, also while it runs.
 
-    Parameters
-    ----------
-    out
-        Folder or URL of the batch.
+    `out` is the folder or URL of the batch.
 
-    Returns
-    -------
-    BatchStatus
-        The sums are 0 if no trip has been recorded.
-
-    Raises
-    ------
-    InvalidInputError
-        If the folder does not exist.
-    OutputError
-        If the storage of the URL does not answer.
-
-    Examples
-    --------
     >>> import tempfile
     >>> print(batch_status(tempfile.mkdtemp()))
     0 trips done, 0 failed, 0 errors
     0.0 hours of video, 0 frames, 0 vehicles, 0.0 frames/s per worker
     """
-    store = open_store(out)
-    counts: Counter[str] = Counter()
-    sums: Counter[str] = Counter()
-    messages = {}
-    for record in read_records(store, record_keys(store)).values():
-        counts[record["status"]] += 1
-        if record["status"] == DONE:
-            for name in ("frames", "tracks", "video_seconds", "seconds"):
-                sums[name] += record.get(name, 0)
-        else:
-            messages[record["sources"][0]["uri"]] = record.get("message", "")
+    records = list(read_records(open_store(out)).values())
+    done = [record for record in records if record["status"] == DONE]
+    bad = [record for record in records if record["status"] != DONE]
+    counts = Counter(record["status"] for record in records)
+    names = ("frames", "tracks", "video_seconds", "seconds")
+    sums = {name: sum(record.get(name, 0) for record in done) for name in names}
     return BatchStatus(
-        done=counts[DONE],
-        failed=counts[FAILED],
-        errors=counts[ERROR],
+        **{name: counts[status] for name, status in COUNTS.items()},
         frames=sums["frames"],
         tracks=sums["tracks"],
         video_seconds=float(sums["video_seconds"]),
         work_seconds=float(sums["seconds"]),
-        messages=dict(sorted(messages.items())),
+        messages=dict(sorted((record["sources"][0]["uri"], record.get("message", "")) for record in bad)),
     )
 
 
 def batch_summary(out: str | os.PathLike[str]) -> pandas.DataFrame:
     """Summarize each trip of a batch in a row of a table, also while it runs.
 
-    A trip whose changed source cannot be processed has a second row with its earlier results.
+    A trip whose changed source cannot be processed has a second row with its earlier results. Rows are in the
+    order of date, camera and first file; values that a trip does not have are missing.
 
-    Parameters
-    ----------
-    out
-        Folder or URL of the batch.
-
-    Returns
-    -------
-    pandas.DataFrame
-        In the order of date, camera and first file: ``key, status, camera, date, start, first_file, files,
-        frames, video_seconds, tracks, work_seconds, message, damage, tracks_file, video_file``. Values that a
-        trip does not have are missing.
-
-    Raises
-    ------
-    InvalidInputError
-        If the folder does not exist.
-    OutputError
-        If the storage of the URL does not answer.
-
-    Examples
-    --------
     >>> import tempfile
     >>> len(batch_summary(tempfile.mkdtemp()))
     0
     """
     import pandas
 
-    store = open_store(out)
-    rows = [_summary_row(key, record) for key, record in read_records(store, record_keys(store)).items()]
+    rows = [_summary_row(key, record) for key, record in read_records(open_store(out)).items()]
     rows.sort(key=lambda row: (row["date"] or "", row["camera"] or "", row["first_file"]))
     return pandas.DataFrame(rows, columns=_SUMMARY_COLUMNS)
 
 
 def _summary_row(key: str, record: Mapping[str, Any]) -> dict[str, Any]:
     sources, outputs = record["sources"], record.get("outputs", {})
-    same = ("status", "camera", "date", "start", "frames", "video_seconds", "tracks", "message", "damage")
-    row = {
-        "key": key,
-        "first_file": sources[0]["uri"],
-        "files": len(sources),
-        "work_seconds": record.get("seconds"),
-        "tracks_file": outputs.get("tracks"),
-        "video_file": outputs.get("video"),
-        **{name: record.get(name) for name in same},
-    }
-    return {name: encodable(value) if isinstance(value, str) else value for name, value in row.items()}
+    row: dict[str, Any] = {**dict.fromkeys(_SUMMARY_COLUMNS), **record}
+    row |= {"key": key, "first_file": sources[0]["uri"], "files": len(sources)}
+    row |= {f"{kind}_file": outputs.get(kind) for kind in ("tracks", "video")}
+    row["work_seconds"] = record.get("seconds")
+    listed = {name: row[name] for name in _SUMMARY_COLUMNS}
+    return {name: encodable(value) if isinstance(value, str) else value for name, value in listed.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
@@ -132,34 +133,29 @@ class Store:
 
     def publish(self, file: Path, path: str) -> None:
         """Copy a complete local file."""
-        if self._folder:
-            with self._replace(path) as part:
-                shutil.copyfile(file, part)
-        else:
-            self._upload(path, lambda target: self._files.put_file(str(file), target))
+        copy = functools.partial(shutil.copyfile, file)
+        self._put(path, copy, functools.partial(self._files.put_file, str(file)))
 
     def write(self, path: str, data: bytes) -> None:
         """Write a small file."""
-        if self._folder:
-            with self._replace(path) as part:
-                part.write_bytes(data)
-        else:
-            self._upload(path, lambda target: self._files.pipe_file(target, data))
+        self._put(
+            path, lambda part: part.write_bytes(data), lambda target: self._files.pipe_file(target, data)
+        )
 
-    def _replace(self, path: str) -> contextlib.AbstractContextManager[Path]:
-        target = Path(self._path(path))
-        target.parent.mkdir(parents=True, exist_ok=True)
-        return atomic_write(target)
-
-    def _upload(self, path: str, request: Callable[[str], object]) -> None:
-        """Write a remote file; object stores need no folders, other storages do."""
+    def _put(self, path: str, copy: Callable[[Path], object], upload: Callable[[str], object]) -> None:
+        """Write a file: in a folder by `copy` to a temporary file, in remote storage by `upload`."""
         target, what = self._path(path), f"/{path} cannot be written"
+        if self._folder:
+            Path(target).parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(target) as part:
+                copy(part)
+            return
         try:
-            self._request(what, lambda: request(target))
-        except FileNotFoundError:
+            self._request(what, lambda: upload(target))
+        except FileNotFoundError:  # object stores need no folders, other storages do
             folder = target.rpartition("/")[0]
             self._request(what, lambda: self._files.makedirs(folder, exist_ok=True))
-            self._request(what, lambda: request(target))
+            self._request(what, lambda: upload(target))
 
     def remove(self, path: str) -> None:
         """Remove a file, if it is there."""

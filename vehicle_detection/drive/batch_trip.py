@@ -8,7 +8,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,12 +38,7 @@ from vehicle_detection.drive.batch_records import (
     write_record,
 )
 from vehicle_detection.drive.batch_store import Store, open_store
-from vehicle_detection.errors import (
-    InvalidInputError,
-    TransientVideoError,
-    VehicleDetectionError,
-    VideoError,
-)
+from vehicle_detection.errors import InvalidInputError, TransientVideoError, VehicleDetectionError, VideoError
 from vehicle_detection.formats import DIGITS, track_records
 from vehicle_detection.network import Device
 from vehicle_detection.video import FrameSource, download, open_source, process_video
@@ -121,12 +116,8 @@ def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
         if record is not None and is_complete(record, store.exists) and not task.get("again"):
             return record | {"new": False}
         started = time.time()
-        record = {
-            **{name: task[name] for name in RECORDED},
-            "version": __version__,
-            "host": platform.node(),
-            "started": started,
-        }
+        record = {name: task[name] for name in RECORDED}
+        record |= {"version": __version__, "host": platform.node(), "started": started}
         try:
             record |= _replace(store, task)
         except Exception as error:
@@ -175,25 +166,22 @@ def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
     settings, key = task["settings"], task["key"]
     detector = _detector(settings, task["fingerprint"])
     place = f"date={task['date']}/camera={task['camera']}/{key}"
-    with _scratch(store, key) as folder:
+    # A folder on a local disk, where ffmpeg writes. Another process may work on the same trip of a store
+    # without locks, and has its own.
+    batch = hashlib.sha256(store.name.encode("utf-8", "surrogateescape")).hexdigest()[:8]
+    scratch = f"vehicle-batch-{batch}-{key}"
+    with temporary_folder(Path(tempfile.gettempdir()), scratch) as folder:
         video = None if settings["tracks_only"] else folder / "video.mp4"
         try:
             with _open(task, folder) as source, _open_tracks(folder / "tracks.parquet", key) as write:
-                report = process_video(
-                    source,
-                    video,
-                    detector,
-                    audio=settings["audio"],
-                    preset=settings["preset"],
-                    workers=1,
-                    every=settings["options"].get("every"),
-                    progress=False,
-                    on_result=write,
-                )
+                options = {name: settings[name] for name in ("audio", "preset")}
+                options |= {"every": settings["options"].get("every"), "workers": 1, "progress": False}
+                report = process_video(source, video, detector, on_result=write, **options)
         except VideoError as error:
             message = str(error).replace(str(folder / "video.mp4"), f"the video in {folder.parent}")
             raise type(error)(_with_urls(message, task, folder)) from error
         damage = _with_urls(report.damage, task, folder)
+        rows = import_pyarrow().parquet.read_metadata(folder / "tracks.parquet").num_rows
         outputs = {"tracks": f"tracks/{place}.parquet"}
         if video is not None:  # the larger file first, for which there may be no space
             outputs["video"] = f"videos/{place}.mp4"
@@ -205,7 +193,7 @@ def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
         "video_seconds": round(float(report.frames / report.fps), 3),
         "size": [report.shape[1], report.shape[0]],
         "tracks": report.tracks,
-        "rows": write.rows,
+        "rows": rows,
         "outputs": outputs,
         **({"damage": damage} if damage else {}),
     }
@@ -254,47 +242,27 @@ def _check_access(file: str) -> None:
     try:
         with open(file, "rb") as opened:
             opened.read(1)
+    except FileNotFoundError as error:
+        raise TransientVideoError(f"{file} cannot be read (removed, renamed or unmounted)") from error
     except OSError as error:
-        if isinstance(error, FileNotFoundError):
-            raise TransientVideoError(f"{file} cannot be read (removed, renamed or unmounted)") from error
-        reason = error.strerror or str(error)
-        raise TransientVideoError(
-            f"{file} cannot be read ({reason}); check its permissions and its disk"
-        ) from error
-
-
-class _TripRows:
-    """Writer of the shown tracks of a trip."""
-
-    def __init__(self, write: Callable[[list[dict[str, Any]]], None], key: str) -> None:
-        self._write, self._key = write, key
-        self.rows = 0
-
-    def __call__(self, result: Any) -> None:
-        """Add the shown tracks of a frame's result."""
-        time, records = round(result.time, 4), track_records(result)
-        self._write([{"trip": self._key, "time_s": time, **record} for record in records])
-        self.rows += len(records)
+        problem = f"{file} cannot be read ({error.strerror or error})"
+        raise TransientVideoError(f"{problem}; check its permissions and its disk") from error
 
 
 @contextmanager
-def _open_tracks(path: Path, key: str) -> Iterator[_TripRows]:
-    """Open the Parquet file of a trip's tracks."""
+def _open_tracks(path: Path, key: str) -> Iterator[Callable[[Any], None]]:
+    """Open the Parquet file of a trip's tracks; yield a function that adds those of a frame's result."""
     try:
         import_pyarrow()
     except InvalidInputError as error:  # not the fault of the source
         raise OSError(f"this worker cannot write tracks: {error}") from None
     with open_parquet(path, _COLUMNS) as write:
-        yield _TripRows(write, key)
 
+        def write_result(result: Any) -> None:
+            facts = {"trip": key, "time_s": round(result.time, 4)}
+            write([facts | record for record in track_records(result)])
 
-def _scratch(store: Store, key: str) -> AbstractContextManager[Path]:
-    """Empty folder on a local disk, where ffmpeg writes; what a killed process left there is removed.
-
-    Another process may work on the same trip of a store without locks, and has its own folder.
-    """
-    batch = hashlib.sha256(store.name.encode("utf-8", "surrogateescape")).hexdigest()[:8]
-    return temporary_folder(Path(tempfile.gettempdir()), f"vehicle-batch-{batch}-{key}")
+        yield write_result
 
 
 def _remove_earlier(store: Store, task: Mapping[str, Any], facts: Mapping[str, Any]) -> None:

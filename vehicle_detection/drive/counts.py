@@ -19,43 +19,25 @@ COUNTED: tuple[Kind, ...] = ("met", "overtaken", "overtaking", "passed")
 
 @dataclass(frozen=True, kw_only=True)
 class MinuteCounts:
-    """Counts of one minute, or of a whole drive.
-
-    Attributes
-    ----------
-    start_s, seconds
-        Start and duration; the last minute may be shorter.
-    met, overtaken, overtaking, passed
-        Number of these events; see `Event`.
-    mean_in_view, max_in_view
-        Mean and maximum of the number of vehicles in view: the density of the traffic as the camera sees it.
-    """
+    """Counts of one minute, or of a whole drive."""
 
     start_s: float
-    seconds: float
-    met: int = 0
+    seconds: float  # duration; the last minute may be shorter
+    met: int = 0  # number of these events; see `Event`
     overtaken: int = 0
     overtaking: int = 0
     passed: int = 0
-    mean_in_view: float = 0.0
+    mean_in_view: float = 0.0  # vehicles in view: the density of the traffic as the camera sees it
     max_in_view: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleCounts:
-    """Counts of a drive.
+    """Counts of a drive."""
 
-    Attributes
-    ----------
-    vehicles
-        Number of different tracks.
-    total, minutes
-        `MinuteCounts` of the whole drive and of each of its minutes.
-    """
-
-    vehicles: int
-    total: MinuteCounts
-    minutes: tuple[MinuteCounts, ...]
+    vehicles: int  # number of different tracks
+    total: MinuteCounts  # of the whole drive
+    minutes: tuple[MinuteCounts, ...]  # of each of its minutes
 
     def summary(self) -> str:
         """Describe the counts in one line, whose subject is the own vehicle."""
@@ -67,24 +49,12 @@ class VehicleCounts:
 
 
 def count_vehicles(events: Iterable[Event], table: TrackTable, *, fps: float) -> VehicleCounts:
-    """Count the vehicles of a drive.
+    """Count the vehicles of a drive, and of each of its minutes.
 
     Parameters
     ----------
-    events, table
-        What `find_events` found, and the tracks that it was given.
-    fps
-        Frame rate.
-
-    Returns
-    -------
-    VehicleCounts
-        Counts of the whole drive and of each of its minutes.
-
-    Raises
-    ------
-    InvalidInputError
-        If the frame rate is not a positive number.
+    events, table, fps
+        What `find_events` found, and the tracks and the frame rate that it was given.
 
     Examples
     --------
@@ -104,8 +74,8 @@ def count_vehicles(events: Iterable[Event], table: TrackTable, *, fps: float) ->
     check_type(table, "table", TrackTable, "pass the tracks of the video")
     listed = check_events(events)
     frames = table.counts()
-    minutes = range(math.ceil(len(frames) / rate / 60 - 1e-9))
-    edges = [min(round(number * 60 * rate), len(frames)) for number in (*minutes, len(minutes))]
+    minutes = math.ceil(len(frames) / rate / 60 - 1e-9)
+    edges = [min(round(number * 60 * rate), len(frames)) for number in range(minutes + 1)]
     return VehicleCounts(
         vehicles=len(table.by_track()),
         total=_count(listed, frames, 0, len(frames), rate),
@@ -120,10 +90,7 @@ def _count(events: list[Event], frames: Any, start: int, stop: int, fps: float) 
     return MinuteCounts(
         start_s=start / fps,
         seconds=(stop - start) / fps,
-        met=kinds["met"],
-        overtaken=kinds["overtaken"],
-        overtaking=kinds["overtaking"],
-        passed=kinds["passed"],
+        **{kind: kinds[kind] for kind in COUNTED},
         mean_in_view=round(float(inside.mean()), 2) if len(inside) else 0.0,
         max_in_view=int(inside.max(initial=0)),
     )

@@ -17,7 +17,7 @@ _ALLOWED_FAILURES = 20
 
 @contextlib.contextmanager
 def open_dask(address: str, jobs: int | None = None) -> Iterator[tuple[Executor, str]]:
-    """Connect to a Dask scheduler, or start one.
+    """Connect to a Dask scheduler, or start one; yield the executor for `run_batch` and the dashboard's URL.
 
     Parameters
     ----------
@@ -25,16 +25,6 @@ def open_dask(address: str, jobs: int | None = None) -> Iterator[tuple[Executor,
         Address of a scheduler, such as ``"tcp://host:8786"``, or ``"local"`` to start one on this machine.
     jobs
         Number of worker processes, of one thread each, of a local scheduler; None: one per core.
-
-    Yields
-    ------
-    executor, dashboard
-        The executor for `run_batch`, and the address of the dashboard.
-
-    Raises
-    ------
-    InvalidInputError
-        If distributed is missing, or the scheduler does not answer.
 
     Examples
     --------
@@ -48,26 +38,15 @@ def open_dask(address: str, jobs: int | None = None) -> Iterator[tuple[Executor,
         raise InvalidInputError(
             "dask needs dask[distributed]; pip install 'dask[distributed]', or omit it"
         ) from None
+    scheduler = "distributed.scheduler"
+    options = {f"{scheduler}.allowed-failures": _ALLOWED_FAILURES, f"{scheduler}.worker-saturation": 1.0}
     with contextlib.ExitStack() as stack:
-        stack.enter_context(
-            dask.config.set(
-                {
-                    "distributed.scheduler.allowed-failures": _ALLOWED_FAILURES,
-                    "distributed.scheduler.worker-saturation": 1.0,
-                }
-            )
-        )
+        stack.enter_context(dask.config.set(options))
         target = address
         if address == "local":
-            target = stack.enter_context(
-                distributed.LocalCluster(
-                    n_workers=jobs or available_cores(),
-                    threads_per_worker=1,
-                    processes=True,
-                    dashboard_address=":0",
-                    env=worker_environment(),
-                )
-            )
+            workers = {"n_workers": jobs or available_cores(), "threads_per_worker": 1, "processes": True}
+            cluster = distributed.LocalCluster(**workers, dashboard_address=":0", env=worker_environment())
+            target = stack.enter_context(cluster)
         try:
             client = stack.enter_context(distributed.Client(target))
         except (OSError, ValueError) as error:

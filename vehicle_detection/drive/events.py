@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import csv
+import dataclasses
+import json
 import math
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -14,31 +19,31 @@ from vehicle_detection._common import (
     UNITS,
     Floats,
     Units,
+    atomic_write,
     check_array,
     check_number,
     check_sequence,
     check_shape,
+    check_suffix,
     check_type,
     describe,
+    progress_bar,
 )
 from vehicle_detection.camera import Camera
 from vehicle_detection.drive.history import split_runs, track_histories
 from vehicle_detection.drive.motion import LANE_HALF_WIDTH_M, Bools, Motion, estimate_motion
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tables import TrackTable
+from vehicle_detection.video import cut_video, open_source
 
 Kind = Literal[
-    "headway",
-    "closest_approach",
-    "closing",
-    "hard_closing",
-    "cut_in",
-    "overtaken",
-    "overtaking",
-    "met",
+    "headway", "closest_approach", "closing", "hard_closing", "cut_in", "overtaken", "overtaking", "met",
     "passed",
-]
+]  # fmt: skip
 Side = Literal["left", "right"]
+EVENT_SUFFIXES = (".csv", ".json")
+"""Suffixes of files of events."""
+
 KINDS: dict[Kind, str] = {
     "headway": "following",
     "closest_approach": "closest approach",
@@ -79,6 +84,8 @@ _PASSING_M = 25.0
 _SLOWEST_ONCOMING, _FASTEST_OVERTAKEN = 20.0, 14.0
 # Speed (m/s) over the road from which a vehicle moves.
 _MOVING = 2.0
+# Longest time (s) that a clip shows before and after an event.
+_MAX_EXTENT = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,20 +142,7 @@ class Event:
         return self.text(UNITS["metric"])
 
     def text(self, units: Units, *, with_time: bool = True) -> str:
-        """Describe the event in a line, with its known values.
-
-        Parameters
-        ----------
-        units
-            Units of the distance, a value of ``vehicle_detection._common.UNITS``.
-        with_time
-            Start with the time of the event.
-
-        Returns
-        -------
-        str
-            Such as ``"12.0 s: following vehicle 4, headway 0.6 ± 0.1 s, distance 14.2 ± 1.2 m"``.
-        """
+        """Describe the event, such as "12.0 s: following vehicle 4, headway 0.6 ± 0.1 s"."""
         vehicle, kind = f"vehicle {self.track_id}", KINDS[self.kind]
         # The camera's vehicle follows; in all other events the other one acts, or is met.
         what = f"{kind} {vehicle}" if self.kind == "headway" else f"{vehicle} {kind}"
@@ -192,10 +186,8 @@ def find_events(
 
     Parameters
     ----------
-    table
-        The tracks of the video.
-    fps, shape
-        Frame rate, and ``(height, width, ...)`` of the frames.
+    table, fps, shape
+        The tracks of the video, its frame rate, and ``(height, width, ...)`` of its frames.
     camera
         The camera, whose focal length converts columns to meters; None: a typical dash-cam.
     own_speed_mps
@@ -205,17 +197,8 @@ def find_events(
     Returns
     -------
     tuple of Event
-        In the order of their times.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed.
-
-    Notes
-    -----
-    A lane change of the camera's own vehicle behind another one looks like a cut-in, unless other vehicles
-    show that all of them moved.
+        In the order of their times. A lane change of the camera's own vehicle behind another one looks like a
+        cut-in, unless other vehicles show that all of them moved.
 
     Examples
     --------
@@ -324,9 +307,8 @@ class _Finder:
             begin = before[-1] - 1
             if np.nanmedian(np.abs(motion.lateral_rate[begin : start + 1])) > _MAX_LATERAL_SPEED:
                 continue
-            if motion.lateral[begin] * motion.lateral[start] < -(LANE_HALF_WIDTH_M**2) or self._moved_alike(
-                motions, begin, start
-            ):
+            crossed = motion.lateral[begin] * motion.lateral[start] < -(LANE_HALF_WIDTH_M**2)
+            if crossed or self._moved_alike(motions, begin, start):
                 continue
             inside = np.flatnonzero(np.abs(motion.lateral[begin : start + 1]) < LANE_HALF_WIDTH_M)
             row = begin + int(inside[0])
@@ -338,13 +320,13 @@ class _Finder:
         own = self.motion
         change = own.lateral[end] - own.lateral[begin]
         changes = []
+        start, stop = own.seconds[[begin, end]]
         for other in motions:
-            if other is own:
+            inside = (other.seconds >= start) & (other.seconds <= stop) & (other.at_side == 0)
+            rows = np.flatnonzero(inside)
+            if other is own or not len(rows):
                 continue
-            rows = np.flatnonzero(other.at(own.seconds[begin], own.seconds[end]) & (other.at_side == 0))
-            if len(rows) and other.seconds[rows[-1]] - other.seconds[rows[0]] > 0.6 * (
-                own.seconds[end] - own.seconds[begin]
-            ):
+            if other.seconds[rows[-1]] - other.seconds[rows[0]] > 0.6 * (stop - start):
                 changes.append(other.lateral[rows[-1]] - other.lateral[rows[0]])
         return bool(changes) and float(np.median(changes)) / change > 0.5
 
@@ -423,14 +405,7 @@ class _Finder:
         ]
 
     def _event(
-        self,
-        kind: Kind,
-        row: int,
-        start: int,
-        stop: int,
-        *,
-        side: Side | None = None,
-        speed_row: int | None = None,
+        self, kind: Kind, row: int, start: int, stop: int, *, side: Side | None = None, speed_row: int = -1
     ) -> Event:
         """Describe an event at a row, whose speed is that at `speed_row`, by default the same."""
         motion, frames = self.motion, self.motion.track.frames
@@ -444,17 +419,15 @@ class _Finder:
             values |= {"distance_m": distance, "distance_std_m": std}
             if kind == "headway" and own_speed > _MOVING:
                 values |= {"headway_s": distance / own_speed, "headway_std_s": std / own_speed}
-        speed_row = row if speed_row is None else speed_row
+        speed_row = row if speed_row < 0 else speed_row
         if motion.closing_std[speed_row] <= _MAX_SPEED_STD:
             closing = motion.closing[speed_row], motion.closing_std[speed_row]
             values |= dict(zip(("closing_mps", "closing_std_mps"), closing))
             if math.isfinite(own_speed):
                 values["speed_mps"] = own_speed - closing[0]
         if kind in ("closing", "hard_closing"):
-            values |= {
-                "ttc_s": motion.time_to_collision[row],
-                "ttc_std_s": motion.time_to_collision_std[row],
-            }
+            time_to_collision = motion.time_to_collision[row], motion.time_to_collision_std[row]
+            values |= dict(zip(("ttc_s", "ttc_std_s"), time_to_collision))
         rounded = {name: None if value is None else round(float(value), 2) for name, value in values.items()}
         return Event(
             kind=kind,
@@ -471,3 +444,83 @@ class _Finder:
 def _rows(mask: Bools, start: int, stop: int) -> NDArray[np.intp]:
     """Rows of a range where a mask holds."""
     return np.asarray(start + np.flatnonzero(mask[start:stop]))
+
+
+def write_events(events: Iterable[Event], path: str | os.PathLike[str]) -> int:
+    """Write events to a file, which appears only when it is complete; return their number.
+
+    Parameters
+    ----------
+    events
+        What `find_events` returned.
+    path
+        ``.csv`` (unknown values are empty) or ``.json`` (a list of objects; unknown values are null).
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from vehicle_detection.drive import Event
+    >>> file = Path(tempfile.mkdtemp()) / "events.csv"
+    >>> event = Event(kind="met", track_id=3, frame=50, start_frame=40, end_frame=52, time_s=2.0)
+    >>> write_events([event], file)
+    1
+    >>> print(file.read_text().splitlines()[1])
+    met,3,50,40,52,2.0,,,,,,,,,,
+    """
+    target = check_suffix(path, "path", EVENT_SUFFIXES)
+    rows = [dataclasses.asdict(event) for event in check_events(events)]
+    with atomic_write(target, "path") as part, part.open("w", encoding="utf-8", newline="") as file:
+        if target.suffix.lower() == ".json":
+            json.dump(rows, file, indent=1)
+            file.write("\n")
+        else:
+            writer = csv.DictWriter(file, EVENT_COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+    return len(rows)
+
+
+def cut_clips(
+    events: Iterable[Event],
+    video: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    *,
+    fps: float,
+    margin: float = 2.0,
+    progress: bool = False,
+) -> list[Path]:
+    """Cut a short clip of each event out of an annotated video; return their paths, in the same order.
+
+    Parameters
+    ----------
+    events, video, fps
+        What `find_events` returned, the video that `process_video` wrote, and its frame rate.
+    folder
+        Existing folder; the clips are called ``0012.4s_cut_in_7.mp4`` after time, kind and track.
+    margin
+        Seconds before and after the frames of an event, of which at most 5 s are shown on either side.
+    progress
+        Show a progress bar if standard error is a terminal.
+
+    Examples
+    --------
+    >>> cut_clips([], "found.mp4", "clips", fps=25)
+    []
+    """
+    rate = check_number(fps, "fps", above=0, high=1e6)
+    margin = check_number(margin, "margin", low=0, high=3600)
+    listed = check_events(events)
+    if not listed:
+        return []
+    if not Path(folder).is_dir():
+        raise InvalidInputError(f"folder {folder} does not exist; create it")
+    names = [f"{event.time_s:06.1f}s_{event.kind}_{event.track_id}.mp4" for event in listed]
+    paths = [Path(folder) / name for name in names]
+    bar = progress_bar(progress, len(listed), unit="clip", interactive_only=True)
+    with open_source(video) as source, bar as shown:
+        for event, path in zip(listed, paths):
+            start = max(event.start_frame / rate - margin, event.time_s - _MAX_EXTENT, 0.0)
+            end = min((event.end_frame + 1) / rate + margin, event.time_s + _MAX_EXTENT)
+            cut_video(source, path, start=start, end=end)
+            shown.update()
+    return paths

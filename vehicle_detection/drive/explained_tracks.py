@@ -29,31 +29,14 @@ def explain_tracks(
 ) -> list[TrackPicture]:
     """Explain a box of each of the twelve longest tracks: the largest detected one inside the frame.
 
-    Parameters
-    ----------
-    detector, source, table
-        The detector, a source that can be read again, and the tracks of its frames.
-    every
-        As in `process_video`, with which the tracks were found.
-
-    Returns
-    -------
-    list of TrackPicture
-        In the order of the tracks' ids.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, or the model is a function.
-    VideoError
-        If the source cannot be read.
+    `table` holds the tracks that `detector` found in `source`, which is read again, with the option `every`
+    of `process_video`. The pictures are in the order of the tracks' ids.
     """
     known = [track for track in track_histories(table) if np.isfinite(track.boxes).all(axis=1).any()]
     tracks = sorted(known, key=lambda track: -len(track.frames))[:_MAX_EXPLAINED]
     pictures = []
     with borrow_source(source) as opened:
-        shape = opened.info.shape[:2]
-        fps = float(opened.info.fps)
+        shape, fps = opened.info.shape[:2], float(opened.info.fps)
         offset = round((table.first_time or 0.0) * fps)
         interval = every or (1 if detector.searches_every_frame else search_interval(fps))
         for track in tracks:

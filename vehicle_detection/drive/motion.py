@@ -60,10 +60,6 @@ class Motion:
         """Where the vehicle is in another lane, by at least one standard error."""
         return np.asarray(np.abs(self.lateral) > LANE_HALF_WIDTH_M + self.lateral_std)
 
-    def at(self, start: float, end: float) -> Bools:
-        """Frames from `start` to `end` in seconds."""
-        return np.asarray((self.seconds >= start) & (self.seconds <= end))
-
 
 def estimate_motion(track: TrackHistory, *, fps: float, shape: tuple[int, int], camera: Camera) -> Motion:
     """Estimate the motion of a track in frames of this shape."""

@@ -7,7 +7,7 @@ import io
 import math
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -45,21 +45,6 @@ _SPEED_COLUMNS = {"speed_mps": 1.0, "speed_kmh": 1 / 3.6, "speed_mph": 0.44704}
 class OwnSpeed:
     """Speed of the camera's own vehicle over the time of a video.
 
-    Attributes
-    ----------
-    seconds
-        ``(N,)`` ascending times; 0 is the start of the video.
-    speeds_mps
-        ``(N,)`` speeds over ground in m/s, at least 0.
-    max_gap
-        Seconds between two times from which on the speed between them is unknown.
-
-    Raises
-    ------
-    InvalidInputError
-        If the arrays are empty, of different lengths or not finite, the times do not ascend, or a speed is
-        negative.
-
     Examples
     --------
     >>> speed = OwnSpeed([0.0, 2.0], [10.0, 14.0])
@@ -67,17 +52,17 @@ class OwnSpeed:
     array([12., nan])
     """
 
-    seconds: Floats
-    speeds_mps: Floats
-    max_gap: float = _MAX_GAP
+    seconds: Floats  # (N,) ascending times; 0 is the start of the video
+    speeds_mps: Floats  # (N,) speeds over ground in m/s, at least 0
+    max_gap: float = _MAX_GAP  # seconds between two times from which on the speed is unknown
 
     def __post_init__(self) -> None:
         for name in ("seconds", "speeds_mps"):
-            values = check_array(getattr(self, name), name)
+            given = getattr(self, name)
+            values = check_array(given, name)
             if values.ndim != 1 or not len(values) or values.dtype.kind not in "iuf":
                 raise InvalidInputError(
-                    f"{name} must be a list of numbers, got {describe(getattr(self, name))}; "
-                    "pass at least one"
+                    f"{name} must be a list of numbers, got {describe(given)}; pass at least one"
                 )
             if not np.isfinite(values).all():
                 raise InvalidInputError(f"{name} must be finite, got NaN or infinity; drop these values")
@@ -97,11 +82,7 @@ class OwnSpeed:
 
     @classmethod
     def constant(cls, speed_mps: float) -> OwnSpeed:
-        """Return a speed that does not change.
-
-        >>> OwnSpeed.constant(25.0).at([0.0, 3600.0])
-        array([25., 25.])
-        """
+        """Return a speed that does not change."""
         speed = check_number(speed_mps, "speed_mps", low=0, high=_MAX_SPEED)
         return cls(np.array([-1e12, 1e12]), np.array([speed, speed]), max_gap=1e13)
 
@@ -114,28 +95,17 @@ class OwnSpeed:
             )
         times: Floats = given.astype(np.float64)
         speeds = np.interp(times, self.seconds, self.speeds_mps, left=np.nan, right=np.nan)
-        after = np.clip(np.searchsorted(self.seconds, times), 1, max(len(self.seconds) - 1, 1))
         if len(self.seconds) > 1:
+            after = np.clip(np.searchsorted(self.seconds, times), 1, len(self.seconds) - 1)
             in_gap = self.seconds[after] - self.seconds[after - 1] > self.max_gap
-            exact = np.isin(times, self.seconds)
-            speeds = np.where(in_gap & ~exact, np.nan, speeds)
+            speeds = np.where(in_gap & ~np.isin(times, self.seconds), np.nan, speeds)
         return speeds
 
 
 def own_speeds(speed: OwnSpeed, table: TrackTable, *, fps: float) -> Floats:
-    """Speed of the own vehicle in each frame of a video.
+    """Speed of the own vehicle in m/s in each frame of the tracks of a video; NaN where it is unknown.
 
-    Parameters
-    ----------
-    speed, table
-        Speed over the time of the source, and the tracks of its frames.
-    fps
-        Frame rate, for frames that were added without a time.
-
-    Returns
-    -------
-    numpy.ndarray
-        One value in m/s for each frame from 0 to the last one; NaN where the speed is unknown.
+    `fps` is the frame rate, for frames that were added without a time.
     """
     times = table.times()
     if times is None:
@@ -156,21 +126,6 @@ def read_own_speed(path: str | os.PathLike[str], *, offset: float = 0.0) -> OwnS
         Time of the video's start in the record: seconds after the first point of a track, or the value of
         ``time_s``. Negative if the record starts later than the video.
 
-    Returns
-    -------
-    OwnSpeed
-        Its times count from the start of the video.
-
-    Raises
-    ------
-    InvalidInputError
-        If the file is missing, too large or malformed, has another suffix, or holds no speed.
-
-    Notes
-    -----
-    A GPX file with a document type declaration is refused: GPX needs none, and entities declared there can
-    expand to any size.
-
     Examples
     --------
     >>> import tempfile
@@ -182,18 +137,21 @@ def read_own_speed(path: str | os.PathLike[str], *, offset: float = 0.0) -> OwnS
     check_path(path, "path")
     file = Path(path)
     shift = check_number(offset, "offset", low=-1e9, high=1e9)
-    readers: dict[str, Callable[[bytes, str], tuple[Floats, Floats]]] = {".gpx": _read_gpx, ".csv": _read_csv}
-    reader = readers.get(file.suffix.lower())
+    reader = {".gpx": _read_gpx, ".csv": _read_csv}.get(file.suffix.lower())
     if reader is None:
         raise InvalidInputError(f"path must end in .gpx or .csv, got {file.name!r}; convert the record")
-    seconds, speeds = reader(read_regular_file(file, f"path {file}", Limit.RECORD_BYTES), str(file))
-    order = np.argsort(seconds, kind="stable")
-    seconds, speeds = seconds[order], speeds[order]
-    new = np.diff(seconds, prepend=-np.inf) > 0
-    return OwnSpeed(seconds[new] - shift, speeds[new])
+    rows = reader(read_regular_file(file, f"path {file}", Limit.RECORD_BYTES), str(file))
+    seconds, speeds = _ascending(np.array(rows)).T
+    return OwnSpeed(seconds - shift, speeds)
 
 
-def _read_csv(data: bytes, name: str) -> tuple[Floats, Floats]:
+def _ascending(rows: Floats) -> Floats:
+    """Sort rows by their times, the first column, and keep the first one of each time."""
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    return rows[np.diff(rows[:, 0], prepend=-np.inf) > 0]
+
+
+def _read_csv(data: bytes, name: str) -> Sequence[tuple[float, float]]:
     """Read times (s) and speeds (m/s) of a table."""
     try:
         table = list(csv.reader(io.StringIO(data.decode("utf-8-sig"), newline="")))
@@ -226,8 +184,7 @@ def _read_csv(data: bytes, name: str) -> tuple[Floats, Floats]:
         rows.append((time, speed))
     if not rows:
         raise InvalidInputError(f"path {name} has no rows below its header")
-    times, speeds = np.array(rows).T
-    return times, speeds
+    return rows
 
 
 class _NoDoctype(ElementTree.TreeBuilder):
@@ -256,7 +213,7 @@ def _parse_time(text: str) -> float:
         return math.nan
 
 
-def _read_gpx(data: bytes, name: str) -> tuple[Floats, Floats]:
+def _read_gpx(data: bytes, name: str) -> Floats:
     """Read times (s) since the first point, and speeds (m/s), of the points of a GPX document."""
     parser = ElementTree.XMLParser(target=_NoDoctype())
     try:
@@ -276,9 +233,7 @@ def _read_gpx(data: bytes, name: str) -> tuple[Floats, Floats]:
         )
         for point in document.iterfind(".//{*}trkpt")
     ]
-    points = np.array([row for row in rows if math.isfinite(row[0])]).reshape(-1, 4)
-    points = points[np.argsort(points[:, 0], kind="stable")]
-    points = points[np.diff(points[:, 0], prepend=-np.inf) > 0]
+    points = _ascending(np.array([row for row in rows if math.isfinite(row[0])]).reshape(-1, 4))
     if len(points) < 2:
         raise InvalidInputError(
             f"path {name} must have at least two track points with times, got {len(points)}; export a "
@@ -300,7 +255,7 @@ def _read_gpx(data: bytes, name: str) -> tuple[Floats, Floats]:
             f"path {name} has no speeds, and no positions at most {_MAX_GAP:g} s apart to compute them; "
             "record them every second"
         )
-    return times[known], np.minimum(speeds[known], _MAX_SPEED)
+    return np.column_stack([times[known], np.minimum(speeds[known], _MAX_SPEED)])
 
 
 def _speeds_of(times: Floats, latitude: Floats, longitude: Floats) -> Floats:

@@ -47,17 +47,6 @@ class ReportWriter:
     units
         ``"metric"`` (m and km/h) or ``"imperial"`` (ft and mph).
 
-    Attributes
-    ----------
-    table
-        `TrackTable` of the frames that were added.
-
-    Raises
-    ------
-    InvalidInputError
-        If the page has another suffix, its folder is missing or read-only, or it is the video or the source
-        itself.
-
     Examples
     --------
     >>> write = ReportWriter("report.html", video="found.mp4", source="drive.mp4")
@@ -76,24 +65,20 @@ class ReportWriter:
         units: Literal["metric", "imperial"] = "metric",
     ) -> None:
         check_choice(units, "units", UNITS)
-        self._units = units
-        given: dict[str, Any] = {"path": path, "video": video, "source": source}
-        for name, value in given.items():
-            # A URL may have longer parts than a path.
-            from_url = name == "source" and isinstance(value, str) and is_url(value)
-            if (value is not None or name == "path") and not from_url:
-                check_path(value, name)
-        self._path = Path(path)
-        check_suffix(self._path, "path", (".html", ".htm"))
+        self._path = check_suffix(path, "path", (".html", ".htm"))
         for name, value in (("video", video), ("source", source)):
-            if value is not None and os.path.realpath(value) == os.path.realpath(self._path):
+            if value is None:
+                continue
+            if not (name == "source" and isinstance(value, str) and is_url(value)):
+                check_path(value, name)  # a URL may have longer parts
+            if os.path.realpath(value) == os.path.realpath(self._path):
                 raise InvalidInputError(f"path {self._path} is also the {name}; choose another name")
         self._video = None if video is None else Path(video)
         self._source = None if source is None else Path(hide_credentials(os.fspath(source))).name
-        self._source_path = None if source is None else str(Path(os.fspath(source)))
-        self._detector = detector
+        self._source_path = None if source is None else str(Path(source))
+        self._detector, self._units = detector, units
         self._embed_limit = check_integer(embed_limit, "embed_limit", low=0)
-        self.table = TrackTable()
+        self.table = TrackTable()  # of the frames that were added
 
     def __call__(self, result: Any) -> None:
         """Add one frame's result: for ``process_video(..., on_result=...)``."""
@@ -110,19 +95,10 @@ class ReportWriter:
 
         Parameters
         ----------
-        report
-            What `process_video` returned.
-        events
-            What `find_events` found in `table`; None: they are found here.
+        report, events
+            What `process_video` returned, and what `find_events` found in `table`; None: found here.
         pictures
             `TrackPicture` objects to list below the tracks.
-
-        Raises
-        ------
-        InvalidInputError
-            If an argument is malformed, or the folder of the page is missing or read-only.
-        OutputError
-            If the page cannot be written, for example because the disk is full.
         """
         check_type(report, "report", VideoReport, "pass what process_video returned")
         if events is None:
@@ -134,18 +110,19 @@ class ReportWriter:
         listed = check_sequence(pictures, "pictures", "TrackPicture")
         for picture in listed:
             check_type(picture, "pictures", TrackPicture, "omit them, or pass TrackPicture objects")
-        options = {
-            "events": check_events(events),
-            "video": self._embed(),
-            "source": self._source,
-            "detector": self._detector,
-            "units": self._units,
-            "pictures": listed,
-        }
         if self._source_path and self._source:  # without its folder, as in the title
             damage = report.damage.replace(self._source_path, self._source)
             report = dataclasses.replace(report, damage=damage)
-        pieces = render_page(self.table, report, **options)
+        pieces = render_page(
+            self.table,
+            report,
+            events=check_events(events),
+            video=self._embed(),
+            source=self._source,
+            detector=self._detector,
+            units=self._units,
+            pictures=listed,
+        )
         with (
             atomic_write(self._path, "path") as part,
             # A file name may hold bytes that are not UTF-8; they become question marks.

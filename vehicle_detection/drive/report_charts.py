@@ -6,8 +6,9 @@ pixels. Curves are drawn in a nested SVG that is stretched to the width, with li
 
 from __future__ import annotations
 
+import html
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,7 +19,6 @@ from vehicle_detection._common import Floats, Units
 from vehicle_detection.drawing import color_index
 from vehicle_detection.drive.events import KINDS, Event
 from vehicle_detection.drive.history import TrackHistory, bin_means, split_runs
-from vehicle_detection.drive.report_formatting import format_time, format_value, svg_element
 
 MAX_ROWS = 14
 """Largest number of tracks that get a row each in `gantt`; more tracks share rows."""
@@ -100,14 +100,9 @@ class ValueAxis:
 
 
 def chart(
-    content: str,
-    time_axis: TimeAxis,
-    value_axis: ValueAxis,
-    *,
-    label: str,
-    track_labels: Iterable[Label] = (),
+    content: str, time_axis: TimeAxis, value_axis: ValueAxis, *, label: str, names: Iterable[Label] = ()
 ) -> str:
-    """Draw curves or bars (markup) on their axes; `label` is the text alternative."""
+    """Draw curves or bars (markup) with the names of tracks on their axes; `label` describes the chart."""
     height = value_axis.height
     grid, values = [], []
     for value in value_axis.ticks:
@@ -116,18 +111,15 @@ def chart(
         grid.append(svg_element("line", class_=line, x1=0, x2="100%", y1=_decimal(y), y2=_decimal(y)))
         text = format_value(float(value))
         values.append(svg_element("text", text, x="100%", dx=-6, y=_decimal(y + 4), text_anchor="end"))
-    view = f"0 0 {_CURVE_WIDTH} {height}"
-    curves = svg_element(
-        "svg", content, viewBox=view, preserveAspectRatio="none", width="100%", height=height
-    )
-    names = []
-    for each in _separate_labels(track_labels, height):
-        place: dict[str, object] = {"dx": 4} if each.x < 90 else {"dx": -4, "text_anchor": "end"}
+    nested = {"viewBox": f"0 0 {_CURVE_WIDTH} {height}", "preserveAspectRatio": "none"}
+    curves = svg_element("svg", content, **nested, width="100%", height=height)
+    texts = []
+    for each in _separate_labels(names, height):
+        place: dict[str, object] = {"class_": f"track-name c{color_index(each.track)}"}
+        place |= {"dx": 4} if each.x < 90 else {"dx": -4, "text_anchor": "end"}
         place |= {"x": f"{_decimal(each.x)}%", "y": _decimal(each.y)}
-        names.append(
-            svg_element("text", f"#{each.track}", class_=f"track-name c{color_index(each.track)}", **place)
-        )
-    return _graph(values, [*grid, curves, *names], time_axis, height, role="img", label=label)
+        texts.append(svg_element("text", f"#{each.track}", **place))
+    return _graph(values, [*grid, curves, *texts], time_axis, height, role="img", label=label)
 
 
 def gantt(tracks: Sequence[TrackHistory], axis: TimeAxis, *, label: str) -> str:
@@ -148,10 +140,7 @@ def gantt(tracks: Sequence[TrackHistory], axis: TimeAxis, *, label: str) -> str:
         bar = {"y": _decimal(middle - _BAR_HEIGHT / 2), "height": _BAR_HEIGHT, "rx": 3}
         for start, stop in track.spans(max(1, axis.frames // _CURVE_WIDTH)):
             parts.append(svg_element("rect", x=axis.percent(start), width=axis.percent(stop - start), **bar))
-        action = f"Track {track.id}, {times}: show in the video"
-        button = {"role": "button", "tabindex": 0, "aria_label": action}
-        seek = {"data_frame": track.first, "data_track": track.id}
-        bars.append(svg_element("g", *parts, class_=f"bar c{track.color}", **button, **seek))
+        bars.append(_seek_button(parts, f"Track {track.id}, {times}", track.first, track.id))
     height = _ROW_HEIGHT * (max(rows, default=-1) + 1)
     return _graph(row_names, [*bars, *names], axis, height, role="group", label=label)
 
@@ -167,19 +156,18 @@ def event_markers(events: Sequence[Event], axis: TimeAxis, units: Units, *, labe
         names.append(
             svg_element("text", KINDS[kind].capitalize(), class_="track-name", x=0, dx=4, y=top + 13)
         )
-        for event in events:
-            if event.kind != kind:
-                continue
-            text = event.text(units)
-            x, color = axis.percent(event.frame), color_index(event.track_id)
-            parts = [
-                svg_element("title", text),
-                svg_element("circle", cx=x, cy=top + 24, r=5),
-            ]
-            button = {"role": "button", "tabindex": 0, "aria_label": f"{text}: show in the video"}
-            seek = {"data_frame": event.frame, "data_track": event.track_id}
-            markers.append(svg_element("g", *parts, class_=f"bar c{color}", **button, **seek))
+        for event in (each for each in events if each.kind == kind):
+            text, x = event.text(units), axis.percent(event.frame)
+            parts = [svg_element("title", text), svg_element("circle", cx=x, cy=top + 24, r=5)]
+            markers.append(_seek_button(parts, text, event.frame, event.track_id))
     return _graph([], [*names, *markers], axis, _KIND_HEIGHT * len(kinds), role="group", label=label)
+
+
+def _seek_button(parts: Iterable[str], text: str, frame: int, track: int) -> str:
+    """Group of elements in the color of a track that shows a frame in the video."""
+    button = {"role": "button", "tabindex": 0, "aria_label": f"{text}: show in the video"}
+    seek = {"data_frame": frame, "data_track": track}
+    return svg_element("g", *parts, class_=f"bar c{color_index(track)}", **button, **seek)
 
 
 def _assign_rows(tracks: Sequence[TrackHistory], axis: TimeAxis) -> list[int]:
@@ -309,3 +297,34 @@ def _points(bins: NDArray[np.int64], values: Floats, time_axis: TimeAxis, value_
 def _decimal(value: float) -> str:
     """Format a number with at most two decimals."""
     return f"{value:.2f}".rstrip("0").rstrip(".")
+
+
+def format_time(seconds: float, *, tenths: bool = True) -> str:
+    """Format a time of a video, such as "0:03.2" or "1:02:06"."""
+    total = round(seconds, 1 if tenths else 0)
+    minutes, rest = divmod(total, 60)
+    hours, minutes = divmod(int(minutes), 60)
+    end = f"{rest:04.1f}" if tenths else f"{int(rest):02d}"
+    return f"{hours}:{minutes:02d}:{end}" if hours else f"{minutes}:{end}"
+
+
+def format_value(value: object) -> str:
+    """Format a parameter or a value of a model's metadata."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}".replace("-", "\N{MINUS SIGN}")
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {format_value(each)}" for key, each in value.items())
+    if isinstance(value, (tuple, list)):
+        return ", ".join(map(format_value, value))
+    return str(value)
+
+
+def svg_element(name: str, *content: str, **attributes: object) -> str:
+    """Write an SVG element around `content` (markup); attributes are escaped, underscores are hyphens."""
+    pairs = (
+        f' {key.rstrip("_").replace("_", "-")}="{html.escape(str(value))}"'
+        for key, value in attributes.items()
+    )
+    return f"<{name}{''.join(pairs)}>{''.join(content)}</{name}>"

@@ -32,10 +32,11 @@ from vehicle_detection.drive.report_charts import (
     curve,
     end_labels,
     event_markers,
+    format_time,
+    format_value,
     fraction_bar,
     gantt,
 )
-from vehicle_detection.drive.report_formatting import format_time, format_value
 from vehicle_detection.heatmap import HeatParams
 from vehicle_detection.tables import TrackTable
 from vehicle_detection.training import split_table
@@ -121,9 +122,10 @@ def render_page(
     chosen = UNITS[units]
     # Labels in the video state speeds over ground where the own speed is known.
     own = getattr(getattr(detector, "annotator", None), "own_speed", None)
-    relative = " relative" if own is not None else ""
-    tracks = [_in_units(_without_imprecise_speeds(track), chosen) for track in track_histories(table)]
-    css, script, template = map(_read, ("report.css", "report.js", "report.html.j2"))
+    symbols = [chosen.distance_symbol, chosen.speed_symbol + " relative" * (own is not None)]
+    tracks = [_for_page(track, chosen) for track in track_histories(table)]
+    folder, names = files("vehicle_detection.drive"), ("report.css", "report.js", "report.html.j2")
+    css, script, template = (folder.joinpath(name).read_text(encoding="utf-8") for name in names)
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
@@ -151,13 +153,8 @@ def render_page(
         settings=_settings(detector, report.shape),
         model=_model_summary(getattr(detector, "model", None)),
         version=vehicle_detection.__version__,
-        data=_script_data(tracks, axis)
-        | {"units": [chosen.distance_symbol, f"{chosen.speed_symbol}{relative}"]},
+        data=_script_data(tracks, axis) | {"units": symbols},
     )
-
-
-def _read(name: str) -> str:
-    return files("vehicle_detection.drive").joinpath(name).read_text(encoding="utf-8")
 
 
 def _csp_hash(code: str) -> str:
@@ -165,12 +162,15 @@ def _csp_hash(code: str) -> str:
     return f"sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}"
 
 
-def _in_units(track: TrackHistory, units: Units) -> TrackHistory:
-    """Convert distances and speeds, although the names of the columns say SI units."""
+def _for_page(track: TrackHistory, units: Units) -> TrackHistory:
+    """Hide speeds with a large standard error, as in the video, and convert the columns to other units."""
+    imprecise = track.columns["speed_std_mps"] > MAX_SPEED_STD
+    speeds = np.where(imprecise, np.nan, track.columns["speed_mps"])
     factors = {"distance_m": units.distance, "distance_std_m": units.distance}
     factors |= {"speed_mps": units.speed, "speed_std_mps": units.speed}
-    columns = {name: factors.get(name, 1.0) * values for name, values in track.columns.items()}
-    return dataclasses.replace(track, columns=columns)
+    columns = track.columns | {"speed_mps": speeds}
+    converted = {name: factors.get(name, 1.0) * values for name, values in columns.items()}
+    return dataclasses.replace(track, columns=converted)
 
 
 def _notices(tracks: Sequence[TrackHistory], report: VideoReport, detector: Any) -> list[str]:
@@ -280,15 +280,8 @@ def _curve_figure(
     curves = "".join(curve(track, name, axis, value_axis, std=std) for track in tracks)
     ends = end_labels(tracks, name, axis, value_axis)
     label = f"Lines: {quantity} of each track, from {extent}"
-    svg = chart(curves, axis, value_axis, label=label, track_labels=ends)
+    svg = chart(curves, axis, value_axis, label=label, names=ends)
     return Figure(quantity.capitalize(), note, svg)
-
-
-def _without_imprecise_speeds(track: TrackHistory) -> TrackHistory:
-    """Hide speeds with a large standard error, as in the video."""
-    imprecise = track.columns["speed_std_mps"] > MAX_SPEED_STD
-    speeds = np.where(imprecise, np.nan, track.columns["speed_mps"])
-    return dataclasses.replace(track, columns={**track.columns, "speed_mps": speeds})
 
 
 def _script_data(tracks: Sequence[TrackHistory], axis: TimeAxis) -> dict[str, Any]:
@@ -360,7 +353,7 @@ def _model_summary(model: Any) -> dict[str, Any] | None:
         if name == "metrics":
             shown = {key: value for key, value in shown.items() if key not in ("splits", "left_out")}
         groups.append(Group(name.capitalize(), shown))
-    tables = [_split_table(_scores(metadata, "splits")), _left_out_table(_scores(metadata, "left_out"))]
+    tables = _score_tables(metadata)
     return {
         "title": title,
         "license": _license(metadata),
@@ -369,31 +362,30 @@ def _model_summary(model: Any) -> dict[str, Any] | None:
     }
 
 
-def _scores(metadata: Mapping[str, Any], name: str) -> dict[str, Mapping[str, Any]]:
+def _score_tables(metadata: Mapping[str, Any]) -> list[Table]:
     """Scores of a model by data set; a model file may hold anything, and other values are ignored."""
-    metrics = metadata.get("metrics")
-    scores = metrics.get(name) if isinstance(metrics, Mapping) else None
-    listed = scores.items() if isinstance(scores, Mapping) else ()
-    return {key: values for key, values in listed if isinstance(values, Mapping)}
 
-
-def _split_table(scores: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Accuracy of a classifier of patches on each split."""
-    titles, rows = split_table(scores)
-    note = "Accuracy on patches that were not used for training; vehicles in whole frames are another task."
-    return Table("Accuracy of the model", note, tuple(map(_heading, titles)), rows)
-
-
-def _left_out_table(scores: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Scores on frames of sources that were left out of training."""
-    columns = ("f1", "average_precision", "precision", "recall", "mean_iou")
+    def scores_of(name: str) -> dict[str, Mapping[str, Any]]:
+        metrics = metadata.get("metrics")
+        scores = metrics.get(name) if isinstance(metrics, Mapping) else None
+        listed = scores.items() if isinstance(scores, Mapping) else ()
+        return {key: values for key, values in listed if isinstance(values, Mapping)}
 
     def cell(value: object) -> str:
         return f"{value:.3f}" if isinstance(value, (int, float)) else str(value)
 
-    rows = [[name, *(cell(values.get(key, "")) for key in columns)] for name, values in scores.items()]
-    note = "Single frames of sources that were left out of training, IoU 0.5."
-    return Table("Quality of the model", note, ("Frames", *map(_heading, columns)), rows)
+    titles, splits = split_table(scores_of("splits"))
+    note = "Accuracy on patches that were not used for training; vehicles in whole frames are another task."
+    columns = ("f1", "average_precision", "precision", "recall", "mean_iou")
+    left_out = [
+        [name, *(cell(values.get(key, "")) for key in columns)]
+        for name, values in scores_of("left_out").items()
+    ]
+    quality = "Single frames of sources that were left out of training, IoU 0.5."
+    return [
+        Table("Accuracy of the model", note, tuple(map(_heading, titles)), splits),
+        Table("Quality of the model", quality, ("Frames", *map(_heading, columns)), left_out),
+    ]
 
 
 def _heading(name: str) -> str:

@@ -6,8 +6,8 @@ import math
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from typing import Literal
+from itertools import groupby
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -15,12 +15,12 @@ from vehicle_detection._common import (
     UNITS,
     Floats,
     Units,
-    atomic_write,
     check_choice,
     check_number,
     check_suffix,
     check_type,
     pluralize,
+    write_text,
 )
 from vehicle_detection.annotator import MAX_SPEED_STD
 from vehicle_detection.drive.events import Event, check_events
@@ -51,8 +51,7 @@ Format: Layer, Start, End, Style, Name, MarginL, MarginR, MarginV, Effect, Text
 """
 
 
-@dataclass(frozen=True)
-class _Nearest:
+class _Nearest(NamedTuple):
     """Medians of a track in one second."""
 
     id: int
@@ -70,35 +69,23 @@ def write_subtitles(
     own_speed: OwnSpeed | None = None,
     units: Literal["metric", "imperial"] = "metric",
 ) -> int:
-    """Write what a video shows as subtitles, second by second; the file appears only when it is complete.
+    """Write what a video shows as subtitles, second by second; return their number.
 
     A subtitle states the own speed if it is known, the largest number of vehicles at once, the nearest one
-    with its distance and speed, and for three seconds each event. Players load a file beside the video with
-    the same name.
+    with its distance and speed, and for three seconds each event; seconds with the same text share one.
+    Players load a file beside the video with the same name. It appears only when it is complete.
 
     Parameters
     ----------
-    table, fps
-        The tracks of the video, and its frame rate.
+    table, fps, events
+        The tracks of the video, its frame rate, and what `find_events` found in the tracks.
     path
         ``.srt`` (SubRip) or ``.ass`` (Advanced SubStation Alpha, in the upper left corner).
-    events
-        What `find_events` found in `table`.
     own_speed
         Speed of the camera's vehicle over the time of the source. Where it is known, speeds are those over
         ground; elsewhere they are relative to the camera.
     units
         ``"metric"`` (m and km/h) or ``"imperial"`` (ft and mph).
-
-    Returns
-    -------
-    int
-        Number of subtitles; seconds with the same text share one.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, the suffix is another one, or the folder is missing or read-only.
 
     Examples
     --------
@@ -127,17 +114,17 @@ def write_subtitles(
     listed = check_events(events)
     cues = list(_merge(_second_texts(table, rate, listed, own_speed, UNITS[units])))
     end = len(table.counts()) / rate
-    with atomic_write(target, "path") as part, part.open("w", encoding="utf-8", newline="\n") as file:
-        if target.suffix.lower() == ".ass":
-            file.write(_ASS_HEADER)
-        for number, (start, stop, lines) in enumerate(cues, start=1):
-            last = min(stop, end)
-            if target.suffix.lower() == ".ass":
-                times, text = f"{_ass_time(start)},{_ass_time(last)}", r"\N".join(lines)
-                file.write(f"Dialogue: 0,{times},Default,,0,0,0,,{text}\n")
-            else:
-                text = "\n".join(lines)
-                file.write(f"{number}\n{_srt_time(start)} --> {_srt_time(last)}\n{text}\n\n")
+    is_ass = target.suffix.lower() == ".ass"
+    text = _ASS_HEADER if is_ass else ""
+    for number, (start, stop, lines) in enumerate(cues, start=1):
+        last = min(stop, end)
+        if is_ass:
+            times, said = f"{_ass_time(start)},{_ass_time(last)}", r"\N".join(lines)
+            text += f"Dialogue: 0,{times},Default,,0,0,0,,{said}\n"
+        else:
+            said = "\n".join(lines)
+            text += f"{number}\n{_srt_time(start)} --> {_srt_time(last)}\n{said}\n\n"
+    write_text(target, text, "path")
     return len(cues)
 
 
@@ -161,10 +148,9 @@ def _second_texts(
         if first == last:  # the frame of an earlier second is still shown
             first, frame_second = first - 1, math.floor((first - 1) / fps + 1e-9)
         speed = None if np.isnan(own[second]) else float(own[second])
+        count = int(counts[first:last].max(initial=0))
         lines = [] if speed is None else [f"own speed {units.speed_text(speed, None, signed=False)}"]
-        lines.append(
-            _vehicles(int(counts[first:last].max(initial=0)), nearest.get(frame_second), speed, units)
-        )
+        lines.append(_vehicles(count, nearest.get(frame_second), speed, units))
         lines += [event.text(units, with_time=False) for event in shown[second]]
         yield tuple(lines)
 
@@ -209,24 +195,18 @@ def _median(values: Floats) -> float | None:
 
 def _merge(texts: Iterable[tuple[str, ...]]) -> Iterator[tuple[int, int, tuple[str, ...]]]:
     """Yield first and last edge, in seconds, and lines of each run of seconds with the same lines."""
-    start, previous = 0, None
-    number = -1
-    for number, lines in enumerate(texts):
-        if previous is not None and lines != previous:
-            yield start, number, previous
-            start = number
-        previous = lines
-    if previous is not None:
-        yield start, number + 1, previous
+    start = 0
+    for lines, run in groupby(texts):
+        stop = start + len(list(run))
+        yield start, stop, lines
+        start = stop
 
 
 def _srt_time(seconds: float) -> str:
-    total = round(seconds * 1000)
-    hours, minutes = divmod(total // 60_000, 60)
-    return f"{hours:02d}:{minutes:02d}:{total // 1000 % 60:02d},{total % 1000:03d}"
+    whole, milliseconds = divmod(round(seconds * 1000), 1000)
+    return f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d},{milliseconds:03d}"
 
 
 def _ass_time(seconds: float) -> str:
-    total = round(seconds * 100)
-    hours, minutes = divmod(total // 6000, 60)
-    return f"{hours}:{minutes:02d}:{total // 100 % 60:02d}.{total % 100:02d}"
+    whole, hundredths = divmod(round(seconds * 100), 100)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}.{hundredths:02d}"

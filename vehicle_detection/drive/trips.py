@@ -7,6 +7,7 @@ With a number, the modification times show whether there is a gap, unless the fi
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import re
@@ -15,13 +16,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path, PurePath, PurePosixPath
-from typing import Any, TypeVar
+from typing import Any
 
 from vehicle_detection._common import check_sequence, describe, is_url, pluralize
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video import FrameSource, Source, is_video_file, list_files, open_source, probe_video
 
-File = TypeVar("File", Path, str)
+File = Path | str
 
 # Seconds by which the start of a segment may differ from the end of the one before: names hold whole seconds.
 _TOLERANCE = 3.0
@@ -67,33 +68,20 @@ class _Segment:
 class Trip:
     """Consecutive segments of one camera.
 
-    Attributes
-    ----------
-    files
-        Files in order: paths, or URLs.
-    camera
-        ``"front"``, ``"rear"``, ``"left"``, ``"right"``, ``"interior"`` or ``"unknown"``.
-    start
-        Time of the first frame by the camera's clock, if the name contains it.
-
-    Examples
-    --------
     >>> print(Trip(("20260131_081500_F.MP4", "20260131_081600_F.MP4"), "front"))
     front, 2 files
     """
 
-    files: tuple[Path | str, ...]
-    camera: str
-    start: datetime | None = None
+    files: tuple[File, ...]  # in order: paths, or URLs
+    camera: str  # front, rear, left, right, interior or unknown
+    start: datetime | None = None  # of the first frame by the camera's clock, if the name contains it
 
     def __str__(self) -> str:
         camera = "" if self.camera == UNKNOWN_CAMERA else f"{self.camera}, "
         return f"{camera}{pluralize(len(self.files), 'file')}"
 
 
-def find_trips(
-    files: Iterable[Path | str], *, duration: Callable[[Path | str], float] | None = None
-) -> list[Trip]:
+def find_trips(files: Iterable[File], *, duration: Callable[[File], float] | None = None) -> list[Trip]:
     """Group files into trips, by their folders and names.
 
     A segment follows another one of the same folder and camera if it starts when the other ends, by the times
@@ -103,20 +91,10 @@ def find_trips(
     Parameters
     ----------
     files
-        Paths or URLs of videos, in any order.
+        Paths or URLs of videos, in any order. The trips are ordered by folder, camera and time.
     duration
         Function that returns the length of a file in seconds; called only where the times in the names leave
         open whether there is a gap. None: such segments are different trips.
-
-    Returns
-    -------
-    list of Trip
-        Ordered by folder, camera and time.
-
-    Raises
-    ------
-    InvalidInputError
-        If `files` is not a sequence of paths or URLs. Exceptions of `duration` are passed on.
 
     Examples
     --------
@@ -128,7 +106,7 @@ def find_trips(
     front 2026-01-31 09:30:00 1
     rear 2026-01-31 08:15:00 1
     """
-    groups: defaultdict[tuple[str, str, str, bool], list[tuple[_Segment, Path | str]]] = defaultdict(list)
+    groups: defaultdict[tuple[str, str, str, bool], list[tuple[_Segment, File]]] = defaultdict(list)
     for file in check_sequence(files, "files", "paths"):
         if not isinstance(file, (str, Path)):
             raise InvalidInputError(f"files must be paths or URLs, got {describe(file)}; pass strings")
@@ -152,25 +130,8 @@ def find_trips(
 def open_trip(source: Source, **options: Any) -> FrameSource:
     """Open the consecutive segments of a folder or pattern as one video, and any other source.
 
-    Parameters
-    ----------
-    source
-        A folder, or a pattern such as ``"CARD/*F.MP4"``, that holds the segments of one trip; or what
-        `open_source` takes.
-    options
-        Those of `open_source`.
-
-    Returns
-    -------
-    FrameSource
-        All frames have the size and rate of the first segment.
-
-    Raises
-    ------
-    InvalidInputError
-        If the source holds several trips, which the message lists, or is refused by `open_source`.
-    VideoError
-        If it cannot be decoded.
+    A folder or a pattern, such as ``"CARD/*F.MP4"``, must hold the segments of one trip; all frames have the
+    size and rate of the first one. Other options: see `open_source`.
 
     Examples
     --------
@@ -192,7 +153,7 @@ def open_trip(source: Source, **options: Any) -> FrameSource:
     return open_source(source, **options)
 
 
-def _posix(file: Path | str) -> PurePosixPath:
+def _posix(file: File) -> PurePosixPath:
     """Path of a file, or of a URL without its query, which may hold another time."""
     text = os.fspath(file)
     if is_url(text):
@@ -210,11 +171,8 @@ def _parse_name(name: PurePosixPath) -> _Segment:
     found = _SHORT_TIME.search(stem) or _TIME.search(stem)
     if found:
         year, *others = (int(part) for part in found.groups())
-        try:
+        with contextlib.suppress(ValueError):  # not a time after all
             start = datetime(year if year >= 100 else 2000 + year, *others)  # type: ignore[arg-type]
-        except ValueError:  # not a time after all
-            start = None
-        else:
             # With a time, a counter adds nothing; other numbers are those of vehicles and channels.
             rest = f"{stem[: found.start()]} {_COUNTER.sub('', stem[found.end() :])}"
     camera, rest = _take_camera(rest, codes=start is not None)
@@ -222,11 +180,10 @@ def _parse_name(name: PurePosixPath) -> _Segment:
         camera = _folder_camera(name)
     numbers = re.findall(r"\d{4,}", stem if start else rest)
     number = int(numbers[-1]) if numbers else None
-    series = (
-        re.sub(r"(?<![A-Za-z0-9])\d{3,}(?![A-Za-z0-9])", "", rest)
-        if start
-        else re.sub(r"\d+(?=\D*$)", "#", rest)
-    )
+    if start:
+        series = re.sub(r"(?<![A-Za-z0-9])\d{3,}(?![A-Za-z0-9])", "", rest)
+    else:
+        series = re.sub(r"\d+(?=\D*$)", "#", rest)
     return _Segment(camera, start, series.strip(" _-.").lower(), number)
 
 
@@ -252,16 +209,13 @@ def _folder_camera(name: PurePosixPath) -> str:
     return UNKNOWN_CAMERA
 
 
-def _split(
-    members: Sequence[tuple[_Segment, Path | str]], duration: Callable[[Path | str], float] | None
-) -> list[Trip]:
+def _split(members: Sequence[tuple[_Segment, File]], duration: Callable[[File], float] | None) -> list[Trip]:
     """Split the sorted files of one camera where a segment does not follow the one before."""
     steps = [_step(before, after) for (before, _), (after, _) in itertools.pairwise(members)]
     usual = _usual_step([step for step in steps if step is not None])
     by_number = members[0][0].start is None
-    trips: list[list[int]] = [[0]]
-    for number, step in enumerate(steps, start=1):
-        before, after = members[number - 1], members[number]
+    trips = [[members[0]]]
+    for before, after, step in zip(members, members[1:], steps):
         if by_number and not _next_number(before[0], after[0]):
             follows = False
         elif step is None or (by_number and abs(step) <= _TOLERANCE):  # copied without their times
@@ -276,13 +230,10 @@ def _split(
             segment = after if by_number else before
             follows = duration is not None and abs(step - duration(segment[1])) <= _TOLERANCE
         if follows:
-            trips[-1].append(number)
+            trips[-1].append(after)
         else:
-            trips.append([number])
-    return [
-        Trip(tuple(members[row][1] for row in rows), members[rows[0]][0].camera, members[rows[0]][0].start)
-        for rows in trips
-    ]
+            trips.append([after])
+    return [Trip(tuple(file for _, file in trip), trip[0][0].camera, trip[0][0].start) for trip in trips]
 
 
 def _step(before: _Segment, after: _Segment) -> float | None:

@@ -98,12 +98,12 @@ class WorkerPool(ThreadPoolExecutor):
         """Wait for all calls, or end them at once after an error."""
         self.shutdown(cancel_futures=kind is not None)
 
-    def _call(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    def _call(self, *call: Any) -> Any:
         """Pass a call to the process of this thread."""
         process = getattr(self._of_thread, "process", None)
         if process not in self._opened:
             process = self._of_thread.process = self._start()
-        return self._ask(process, function, args, kwargs)
+        return self._ask(process, *call)
 
     def _start(self) -> ProcessPoolExecutor:
         with self._start_lock:
@@ -126,16 +126,10 @@ class WorkerPool(ThreadPoolExecutor):
                 raise
         return process
 
-    def _ask(
-        self,
-        process: ProcessPoolExecutor,
-        function: Callable[..., Any],
-        args: tuple[Any, ...],
-        kwargs: dict[str, Any],
-    ) -> Any:
-        """Call a function in a process; its warnings are logged by this one."""
+    def _ask(self, process: ProcessPoolExecutor, *call: Any) -> Any:
+        """Call a function with its arguments in a process; its warnings are logged by this one."""
         try:
-            result, error, warnings = process.submit(_call, function, args, kwargs).result()
+            result, error, warnings = process.submit(_call, *call).result()
         except (BrokenProcessPool, RuntimeError, OSError, EOFError, KeyboardInterrupt) as lost:
             self._close(process)
             raise WorkerLost("the worker process ended before its result") from lost
@@ -160,11 +154,9 @@ def _environment(changes: dict[str, str]) -> Iterator[None]:
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in changes:
+            os.environ.pop(name, None)
+        os.environ.update({name: value for name, value in before.items() if value is not None})
 
 
 # What follows runs in the worker process.
@@ -198,26 +190,17 @@ def _watch(parent: Connection) -> None:
     os._exit(1)
 
 
-class _Collector(logging.Handler):
-    """Keeps the texts of warnings, which the parent process logs."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.texts: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.texts.append(record.getMessage())
-
-
 def _call(function: Callable[..., Any], args: Any, kwargs: Any) -> tuple[Any, str | None, list[str]]:
     """Call a function; return its result, its error and its warnings as plain values."""
-    logger, collector = logging.getLogger("vehicle_detection"), _Collector()
+    warnings: list[str] = []
+    logger, collector = logging.getLogger("vehicle_detection"), logging.Handler(logging.WARNING)
+    collector.emit = lambda record: warnings.append(record.getMessage())  # type: ignore[method-assign]
     logger.addHandler(collector)
     _busy.set()
     try:
-        return function(*args, **kwargs), None, collector.texts
+        return function(*args, **kwargs), None, warnings
     except Exception as error:
-        return None, f"{type(error).__name__}: {error}", collector.texts
+        return None, f"{type(error).__name__}: {error}", warnings
     finally:
         _busy.clear()
         logger.removeHandler(collector)

@@ -1,13 +1,135 @@
-"""The details of a vehicle's surfaces: windows, lamps, plates, bumpers, wheels."""
+"""Painted bodies of vehicles: surfaces in meters, and what is painted on the ends and flanks."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vehicle_detection.scenes.raster import Color, Doubles, Floats
+from vehicle_detection.scenes.raster import Color, Doubles, Floats, blend, tile_to, wrapped_noise
 from vehicle_detection.scenes.shapes import BodyShape, profile_at
-from vehicle_detection.scenes.surface import Mask, SurfaceCanvas, round_corners
+
+PIXELS_PER_METER = 112
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A painted surface: ``(H, W, 4)`` premultiplied RGBA, 0-255."""
+
+    rgba: Floats
+    left: float  # position of the upper left corner (m)
+    top: float
+    depth: Floats | None = None  # (H, W) distance behind the nearest point (m)
+    _mipmaps: dict[tuple[int, ...], Floats] = field(default_factory=dict, init=False)
+
+    def mipmap(self, x_ratio: float, y_ratio: float) -> tuple[Floats, float, float]:
+        """Return the surface reduced by up to these ratios, and its pixels per meter along x and y."""
+        steps = [int(np.clip(np.log2(max(ratio, 1.0)) + 0.25, 0, 6)) for ratio in (x_ratio, y_ratio)]
+        height, width = self.rgba.shape[:2]
+        size = (max(1, width >> steps[0]), max(1, height >> steps[1]))
+        if size not in self._mipmaps:
+            rgba = cv2.resize(self.rgba, size, interpolation=cv2.INTER_AREA) if any(steps) else self.rgba
+            self._mipmaps[size] = np.asarray(rgba, np.float32)
+        return self._mipmaps[size], PIXELS_PER_METER * size[0] / width, PIXELS_PER_METER * size[1] / height
+
+
+@dataclass(frozen=True, eq=False)
+class Mask:
+    """Coverage of pixels by a shape, 0-1, in the part of a canvas where the shape lies."""
+
+    values: Floats
+    region: tuple[slice, slice]  # rows and columns of the part
+    size: tuple[int, int]  # of the canvas
+
+    def _aligned(self, other: Mask) -> Floats:
+        """Values of another mask in this region, 0 where the other does not reach."""
+        values = np.zeros(self.size, np.float32)
+        values[other.region] = other.values
+        return values[self.region]
+
+    def __and__(self, other: Mask) -> Mask:
+        return replace(self, values=self.values * self._aligned(other))
+
+    def __sub__(self, other: Mask) -> Mask:
+        return replace(self, values=np.maximum(self.values - self._aligned(other), 0))
+
+
+class SurfaceCanvas:
+    """A canvas from `left` to `right` and `low` to `top` in meters, to paint polygons on."""
+
+    def __init__(self, left: float, right: float, low: float, top: float) -> None:
+        ppm = PIXELS_PER_METER
+        self.left, self.top = left, top
+        height, width = self.size = round((top - low) * ppm), round((right - left) * ppm)
+        columns, rows = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
+        self.x: Floats = np.asarray(left + (columns[None, :] + 0.5) / ppm, np.float32)
+        self.y: Floats = np.asarray(top - (rows[:, None] + 0.5) / ppm, np.float32)
+        self.color: Floats = np.zeros((*self.size, 3), np.float32)
+        self.alpha: Floats = np.zeros(self.size, np.float32)
+
+    def polygon(self, points: ArrayLike, *, soften: float = 0.0) -> Mask:
+        """Mask of a polygon of ``(x, y)`` points, blurred by `soften` meters."""
+        corners = (np.asarray(points, np.float64) - (self.left, self.top)) * (1, -1) * PIXELS_PER_METER - 0.5
+        margin = 2 + int(3 * soften * PIXELS_PER_METER)
+        x1, y1 = np.maximum(np.floor(corners.min(0)).astype(int) - margin, 0).tolist()
+        x2, y2 = np.minimum(np.ceil(corners.max(0)).astype(int) + margin + 1, self.size[::-1]).tolist()
+        filled = np.zeros((y2 - y1, x2 - x1), np.uint8)
+        cv2.fillPoly(filled, [np.rint((corners - (x1, y1)) * 16).astype(np.int32)], 255, cv2.LINE_AA, 4)
+        values = filled.astype(np.float32) / 255
+        if soften:
+            values = cv2.GaussianBlur(values, (0, 0), soften * PIXELS_PER_METER)  # type: ignore[assignment]
+        return Mask(np.asarray(values, np.float32), (slice(y1, y2), slice(x1, x2)), self.size)
+
+    def between(self, left: Doubles, right: Doubles, y: Doubles, *, soften: float = 0.0) -> Mask:
+        """Mask of the area between two curves, given by their `x` at ascending heights `y`."""
+        outline = np.column_stack([np.append(left, right[::-1]), np.append(y, y[::-1])])
+        return self.polygon(outline, soften=soften)
+
+    def box(self, x: float, y: float, width: float, height: float, *, radius: float = 0.0) -> Mask:
+        """Mask of a box centered at ``(x, y)`` with rounded corners."""
+        w, h = width / 2, height / 2
+        corners = [(x - w, y - h), (x + w, y - h), (x + w, y + h), (x - w, y + h)]
+        return self.polygon(round_corners(corners, radius))
+
+    def paint(self, mask: Mask, color: ArrayLike, opacity: float = 1.0) -> None:
+        """Composite a color, or an ``(H, W, 3)`` image of colors, under a mask."""
+        paint = np.asarray(color, np.float32)
+        if paint.ndim == 3:
+            paint = np.broadcast_to(paint, self.color.shape)[mask.region]
+        blend(self.color[mask.region], paint, (mask.values * opacity)[..., None])
+
+    def multiply(self, mask: Mask, gain: float) -> None:
+        """Multiply the color under a mask by `gain`."""
+        self.color[mask.region] *= (1 + mask.values * (gain - 1))[..., None]
+
+    def make_opaque(self, mask: Mask) -> None:
+        """Add a mask to the opaque part of the canvas."""
+        alpha = self.alpha[mask.region]
+        np.maximum(alpha, mask.values, out=alpha)
+
+    def surface(self, depth: Floats | None = None) -> Surface:
+        """Return what has been painted."""
+        color = np.clip(self.color, 0, 255) * self.alpha[..., None]
+        return Surface(np.dstack([color, self.alpha * 255]), self.left, self.top, depth)
+
+
+def round_corners(corners: ArrayLike, radius: float) -> Doubles:
+    """Replace each corner of a polygon by a curve that starts `radius` before it."""
+    points = np.asarray(corners, np.float64)
+    if radius <= 0:
+        return points
+    t = np.linspace(0, 1, 7)[:, None]
+    curves = []
+    for before, corner, after in zip(np.roll(points, 1, 0), points, np.roll(points, -1, 0)):
+        start, end = (
+            corner + (other - corner) * min(0.5, radius / max(float(np.linalg.norm(other - corner)), 1e-9))
+            for other in (before, after)
+        )
+        curves.append((1 - t) ** 2 * start + 2 * t * (1 - t) * corner + t**2 * end)
+    return np.concatenate(curves)
 
 
 class BodyPainter:
@@ -277,3 +399,102 @@ class BodyPainter:
             for angle in np.arange(5) * 2 * np.pi / 5 + self.look.seed % 3:
                 spoke = center + np.array([np.cos(angle), np.sin(angle)]) * dims.wheel_radius * 0.42
                 canvas.paint(canvas.polygon(spoke + circle * dims.wheel_radius * 0.13), dark, 0.85)
+
+
+class VehicleBody(BodyShape):
+    """The painted surfaces of one vehicle."""
+
+    @cached_property
+    def near_end(self) -> Surface:
+        """The end towards the camera, with its depth; x is 0 in the middle, y is up."""
+        dims, half = self.dimensions, self.dimensions.width / 2
+        canvas = SurfaceCanvas(-half - 0.04, half + 0.04, dims.clearance - 0.04, dims.height + 0.04)
+        edge = np.maximum(self.half_width(canvas.y), 1e-3).astype(np.float32)
+        across = np.clip(np.abs(canvas.x) / edge, 0, 0.999)
+        power = 4.5  # of the superellipse that rounds the corners
+        bend = 1 - (1 - across**power) ** (1 / power)
+        depth = (profile_at(self.end, canvas.y) + dims.corner * bend).astype(np.float32)
+        smooth = cv2.GaussianBlur(depth, (0, 0), 1.5)
+        slope_y, slope_x = np.gradient(smooth * PIXELS_PER_METER)
+        # The normal of z = depth(x, y) that faces the camera is (dz/dx, dz/dy, -1); rows run downwards.
+        normal = np.stack([slope_x, -slope_y, -np.ones_like(slope_x)], axis=-1).astype(np.float32)
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        y = np.linspace(dims.clearance, dims.height, 60)
+        x = self.half_width(y) * 0.975
+        canvas.make_opaque(canvas.between(x, -x, y))
+        reflection = self._reflect(normal)
+        canvas.color[:] = self._shade(normal, reflection)
+        painter = BodyPainter(self, canvas, reflection)
+        if self.view == "front":
+            painter.paint_front()
+        elif dims.is_box:
+            painter.paint_box_rear()
+        else:
+            painter.paint_rear()
+        self._add_dirt(canvas)
+        return canvas.surface(depth)
+
+    def _shade(self, normal: Floats, reflection: Floats) -> Floats:
+        """Body color in the light: diffuse shading and the reflection of the surroundings."""
+        light = self.light
+        sun = np.clip(normal @ np.asarray(light.to_sun, np.float32), 0, None)
+        gain = light.ambient * (0.72 + 0.36 * normal[..., 1]) + light.sun * sun
+        gloss = 0.1 + 0.35 * (1 - np.abs(normal[..., 2:])) ** 2
+        return np.asarray(self.color * gain[..., None] * (1 - 0.5 * gloss) + reflection * gloss, np.float32)
+
+    def _reflect(self, normal: Floats) -> Floats:
+        """Color of the surroundings that a camera looking along the road sees in a mirror."""
+        light = self.light
+        # Elevation of the reflected ray: road, then a dark band of trees at the horizon, then sky.
+        elevations = [-1.0, -0.25, -0.04, 0.02, 0.22, 0.4, 1.0]
+        low, top = np.asarray(light.sky_low, np.float32), np.asarray(light.sky_top, np.float32)
+        ground = [(58, 58, 60), (80, 80, 80), (92, 92, 90), (60, 66, 58), (72, 80, 74)]
+        colors = np.array([*(np.array(ground) * (0.25 if light.dark else 1.0)), low, 0.5 * (low + top)])
+        steps = np.linspace(-1, 1, 512)
+        table = np.column_stack([np.interp(steps, elevations, channel) for channel in colors.T])
+        index = np.clip((1 - 2 * normal[..., 2] * normal[..., 1]) * 255.5, 0, 511).astype(np.intp)
+        return np.asarray(table.astype(np.float32)[index], np.float32)
+
+    def _add_dirt(self, canvas: SurfaceCanvas) -> None:
+        """Add dust near the ground and a slight unevenness."""
+        dust = np.array([40, 38, 36] if self.light.dark else [96, 92, 86], np.float32)
+        blend(canvas.color, dust, 0.22 * np.clip((0.75 - canvas.y) / 0.6, 0, 1)[..., None])
+        # A generator of its own makes the surface independent of the order in which surfaces are painted.
+        rng = np.random.default_rng([self.seed, canvas.size[1]])
+        noise = tile_to(wrapped_noise(rng, (128, 128), falloff=0.8), *canvas.size)
+        canvas.color *= (1 + 0.012 * noise)[..., None]
+
+    @cached_property
+    def flank(self) -> Surface:
+        """The flank seen from outside: x is the distance behind the near end, y is up."""
+        dims = self.dimensions
+        canvas = SurfaceCanvas(-0.3, dims.length + 0.05, -0.02, dims.height + 0.04)
+        # The doors are upright with a crease; above the belt the windows lean inwards.
+        crease = 0.1 * np.sin((canvas.y - dims.clearance) / (dims.belt - dims.clearance) * 2 * np.pi)
+        tilt = np.where(canvas.y > dims.belt, 0.4, crease).astype(np.float32)
+        normal = np.dstack([np.zeros_like(tilt), tilt, np.full_like(tilt, -0.6)])
+        reflection = np.broadcast_to(self._reflect(normal), (*canvas.size, 3))
+        # The sun on the left and the right flank differs; `render` accounts for it.
+        gain = self.light.ambient * (0.74 + 0.5 * tilt) + 0.3 * self.light.sun
+        canvas.color[:] = self.color * (0.9 * gain)[..., None] + 0.16 * reflection
+        BodyPainter(self, canvas, reflection).paint_flank()
+        self._add_dirt(canvas)
+        return canvas.surface()
+
+    @cached_property
+    def underside(self) -> Surface:
+        """Tires and dark underside below the near end, in the plane of the tires' contact with the road."""
+        dims, half = self.dimensions, self.dimensions.width / 2
+        canvas = SurfaceCanvas(-half, half, -0.02, dims.clearance + dims.wheel_radius)
+        gain = 0.5 if self.light.dark else 1.0
+        canvas.color[:] = np.float32(20 * gain)
+        radius, width = dims.wheel_radius, 0.5 if dims.is_box else 0.2
+        for side in (-1, 1):
+            middle = side * (half - 0.03 - width / 2)
+            tire = canvas.box(middle, radius, width, 2 * radius, radius=0.05)
+            canvas.make_opaque(tire)
+            canvas.paint(tire, np.full(3, 34 * gain))
+            canvas.paint(canvas.box(middle, radius, 0.04, radius), np.full(3, 46 * gain), 0.6)
+        middle = dims.clearance + radius / 2 + 0.02
+        canvas.make_opaque(canvas.box(0, middle, dims.width - 0.16, radius + 0.06))
+        return canvas.surface()

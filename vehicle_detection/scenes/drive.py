@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from vehicle_detection._common import atomic_write, check_choice, check_integer, check_number
+from vehicle_detection.scenes.bodywork import VehicleBody
 from vehicle_detection.scenes.camera_light import SceneConfig, SceneView
 from vehicle_detection.scenes.raster import Rng
 from vehicle_detection.scenes.render import VehiclePose, VehicleTruth
 from vehicle_detection.scenes.scene import RandomState, Scene, SceneRenderer, make_generator
 from vehicle_detection.scenes.scenery import LANE, Road
 from vehicle_detection.scenes.shapes import random_appearance
-from vehicle_detection.scenes.vehicles import VehicleBody
 from vehicle_detection.tables import FrameKey, TrackTable
 
 SCENARIOS = (
@@ -158,8 +158,7 @@ def _passing_vehicles(
 def _oncoming_vehicles(road: Road, duration: float, rng: Rng, first_track: int) -> list[TrafficVehicle]:
     """Vehicles behind the barrier, one after the other in two lanes, visible from 220 m on."""
     vehicles: list[TrafficVehicle] = []
-    visible_from = 220.0
-    speed = -rng.uniform(48, 58)
+    visible_from, speed = 220.0, -rng.uniform(48, 58)
     for lane in (-1, -2):
         time = -visible_from / -speed + rng.uniform(0, 1.5)
         while time < duration:
@@ -261,16 +260,6 @@ def render_drive(
     random_state, **view
         As for `render_scene`.
 
-    Returns
-    -------
-    Drive
-        ``len(drive)``, ``drive[i]`` and iteration; frames are rendered on demand and not kept.
-
-    Raises
-    ------
-    InvalidInputError
-        If an option is out of range.
-
     Examples
     --------
     >>> drive = render_drive(frames=50, shape=(180, 320), scenario="overtaking")
@@ -288,15 +277,14 @@ def render_drive(
 
 def truth_table(frames: Mapping[FrameKey, Sequence[VehicleTruth]]) -> TrackTable:
     """Return the ground truth of frames, by number or file name, as labels with distances and speeds."""
-    rows = [(key, row) for key, found in frames.items() for row in found]
-    columns = {
-        name: [getattr(row, name) for _, row in rows]
-        for name in ("occluded", "truncated", "distance_m", "speed_mps")
-    }
-    columns["ignore"] = [bool(row.ignore) for _, row in rows]
-    boxes = np.array([row.box for _, row in rows], np.float64).reshape(-1, 4)
-    tracks = [row.track for _, row in rows]
-    return TrackTable([key for key, _ in rows], tracks, boxes, frame_keys=tuple(frames), **columns)
+    keys = [key for key, found in frames.items() for _ in found]
+    rows = [row for found in frames.values() for row in found]
+    names = ("occluded", "truncated", "distance_m", "speed_mps")
+    columns = {name: [getattr(row, name) for row in rows] for name in names}
+    columns["ignore"] = [bool(row.ignore) for row in rows]
+    boxes = np.array([row.box for row in rows], np.float64).reshape(-1, 4)
+    tracks = [row.track for row in rows]
+    return TrackTable(keys, tracks, boxes, frame_keys=tuple(frames), **columns)
 
 
 def write_labels(

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer
 from vehicle_detection.camera import Camera
+from vehicle_detection.scenes.bodywork import VehicleBody
 from vehicle_detection.scenes.camera_light import SceneConfig, Sensor, make_light
 from vehicle_detection.scenes.raster import Doubles, Image, Rng
 from vehicle_detection.scenes.render import VehiclePose, draw_vehicle
 from vehicle_detection.scenes.scene import RandomState, make_generator
 from vehicle_detection.scenes.scenery import LANE, Canvas, Road, Scenery
 from vehicle_detection.scenes.shapes import random_appearance
-from vehicle_detection.scenes.vehicles import VehicleBody
 
 _HEIGHT, _WIDTH = 720, 1280
 
@@ -33,7 +33,7 @@ def render_patches(
     Parameters
     ----------
     n, size
-        Number of patches, and their side in pixels.
+        Number of patches, and their side in pixels, 16 to 512.
     random_state
         Seed or generator; the same seed and options give the same bytes.
 
@@ -41,11 +41,6 @@ def render_patches(
     -------
     patches, labels : numpy.ndarray
         ``(n, size, size, 3)`` uint8 RGB, and ``(n,)`` bool: True for the vehicles, which come first.
-
-    Raises
-    ------
-    InvalidInputError
-        If `n` is not a positive integer or `size` is not an integer from 16 to 512.
 
     Examples
     --------

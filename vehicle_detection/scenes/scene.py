@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from vehicle_detection._common import Checked, check_integer, check_sequence, choice, describe, number
 from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.scenes.bodywork import VehicleBody
 from vehicle_detection.scenes.camera_light import SceneConfig, SceneView, Sensor
 from vehicle_detection.scenes.raster import Image, Rng
 from vehicle_detection.scenes.render import VehiclePose, VehicleTruth, composite
 from vehicle_detection.scenes.scenery import Road, Scenery
 from vehicle_detection.scenes.shapes import COLORS, VEHICLE_SHAPES, random_appearance
-from vehicle_detection.scenes.vehicles import VehicleBody
 
 RandomState = int | np.random.Generator | None
 
@@ -122,11 +122,6 @@ def render_scene(
     -------
     Scene
         Image and ground truth. The `track` of a vehicle is its position in `vehicles`, from 1 on.
-
-    Raises
-    ------
-    InvalidInputError
-        If an option is out of range.
 
     Examples
     --------

@@ -1,0 +1,51 @@
+from .batch import BatchReport, run_batch
+from .batch_records import BatchStatus, batch_status, batch_summary, with_source
+from .counts import COUNTED, MinuteCounts, VehicleCounts, count_vehicles
+from .dask_cluster import open_dask
+from .events import (
+    EVENT_COLUMNS,
+    EVENT_SUFFIXES,
+    KINDS,
+    Event,
+    cut_clips,
+    find_events,
+    write_events,
+)
+from .explained_tracks import explain_tracks
+from .own_speed import OwnSpeed, own_speeds, read_own_speed
+from .report import ReportWriter
+from .report_page import TrackPicture
+from .subtitles import SUBTITLE_SUFFIXES, write_subtitles
+from .trips import Trip, find_trips, open_trip
+
+__all__ = [
+    "COUNTED",
+    "EVENT_COLUMNS",
+    "EVENT_SUFFIXES",
+    "KINDS",
+    "SUBTITLE_SUFFIXES",
+    "BatchReport",
+    "BatchStatus",
+    "Event",
+    "MinuteCounts",
+    "OwnSpeed",
+    "ReportWriter",
+    "TrackPicture",
+    "Trip",
+    "VehicleCounts",
+    "batch_status",
+    "batch_summary",
+    "count_vehicles",
+    "cut_clips",
+    "explain_tracks",
+    "find_events",
+    "find_trips",
+    "open_dask",
+    "open_trip",
+    "own_speeds",
+    "read_own_speed",
+    "run_batch",
+    "with_source",
+    "write_events",
+    "write_subtitles",
+]
