@@ -31,9 +31,9 @@ POSIX_MODULES = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "t
 
 GUARDED = {
     ("_common.files", "_lock_folder", "fcntl"): "called unless sys.platform is win32",
-    ("_common.files", "_open_locked", "fcntl"): "called unless sys.platform is win32",
-    ("_common.files", "_open_locked", "os.O_CLOEXEC"): "called unless sys.platform is win32",
-    ("_common.files", "_open_locked", "os.O_NOFOLLOW"): "called unless sys.platform is win32",
+    ("_common.files", "open_locked", "fcntl"): "called unless sys.platform is win32",
+    ("_common.files", "open_locked", "os.O_CLOEXEC"): "called unless sys.platform is win32",
+    ("_common.files", "open_locked", "os.O_NOFOLLOW"): "called unless sys.platform is win32",
     ("_common.files", "_lock_folder", "os.O_CLOEXEC"): "called unless sys.platform is win32",
     ("_common.threads", "available_cores", "os.sched_getaffinity"): "hasattr; macOS does not have it, either",
     ("_common.threads", "", "os.register_at_fork"): "hasattr",
@@ -41,7 +41,6 @@ GUARDED = {
     ("training.trials", "_check_memory", "os.sysconf"): "AttributeError is caught",
     ("drive.worker_pool", "_prepare", "os.setpgid"): "hasattr",
     ("drive.worker_pool", "_private_folder", "os.getuid"): "hasattr",
-    ("drive.batch_store", "_lock_file", "fcntl"): "ImportError is caught",
     ("video.ffmpeg", "", "os.register_at_fork"): "hasattr",
     ("video.ffmpeg", "_enlarge", "fcntl"): "on Linux only",
     ("video.ffmpeg", "_is_memory_limited", "resource"): "ImportError is caught",

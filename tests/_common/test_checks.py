@@ -26,15 +26,10 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.boxes import Detections
 from vehicle_detection.datasets import PatchSet
-from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
+from vehicle_detection.errors import InvalidInputError
 
 IMAGE = np.zeros((4, 6, 3), np.uint8)
 PATCH = np.zeros((64, 64, 3), np.uint8)
-
-
-def test_invalid_input_is_a_value_error_and_an_error_of_the_library():
-    assert issubclass(InvalidInputError, ValueError)
-    assert issubclass(InvalidInputError, VehicleDetectionError)
 
 
 @pytest.mark.parametrize(
@@ -74,9 +69,15 @@ def test_a_long_name_is_shortened():
         check_path(Path("a" * 300))
 
 
-def test_check_image_returns_the_same_array():
+def test_arrays_that_fit_are_returned():
+    boxes = np.array([[0, 1, 2, 3], [5, 5, 5, 5]], np.int16)
+    batch = np.stack([PATCH, PATCH + 1])
     assert check_image(IMAGE) is IMAGE
-    assert check_image(IMAGE[::2, ::-1]).shape == (2, 6, 3)
+    assert check_channel(IMAGE[..., 0]).shape == (4, 6)
+    assert check_boxes(boxes) is boxes
+    assert check_boxes([[0.5, 1, 2, 3]]).dtype == np.float64
+    assert check_patches(batch, 64) is batch
+    assert check_patches(PatchSet(batch, [0, 1], ["a/b/c.png"] * 2), 64) is batch
 
 
 @pytest.mark.parametrize(
@@ -110,21 +111,15 @@ def test_check_image_explains_the_conversion(image, remedy):
         check_image(image, "frame")
 
 
-def test_check_channel():
-    assert check_channel(IMAGE[..., 0]).shape == (4, 6)
-
-
 @pytest.mark.parametrize("channel", [IMAGE, IMAGE[..., 0].astype(float), np.zeros((0, 3), np.uint8), "r"])
 def test_check_channel_refuses(channel):
     with pytest.raises(InvalidInputError, match=r"^img must be one \(H, W\) uint8 channel, got .* pick a"):
         check_channel(channel)
 
 
-def test_check_patches_keeps_an_array_and_stacks_a_list():
+def test_check_patches_stacks_a_list():
     batch = np.stack([PATCH, PATCH + 1])
-    assert check_patches(batch, 64) is batch
     np.testing.assert_array_equal(check_patches([PATCH, PATCH + 1], 64), batch)
-    np.testing.assert_array_equal(check_patches((PATCH, PATCH + 1), 64), batch)
     assert check_patches([], 64).shape == (0, 64, 64, 3)
     assert check_patches(np.empty((0, 32, 32, 3), np.uint8), 32).dtype == np.uint8
 
@@ -156,21 +151,10 @@ def test_check_boxes_accepts_no_boxes(empty):
     assert check_boxes(empty).shape == (0, 4)
 
 
-def test_check_boxes_keeps_dtype_and_values():
-    boxes = np.array([[0, 1, 2, 3], [5, 5, 5, 5]], np.int16)
-    assert check_boxes(boxes) is boxes
-    assert check_boxes([[0.5, 1, 2, 3]]).dtype == np.float64
-
-
 def test_check_boxes_accepts_corner_pairs_and_detections():
     boxes = [[1, 2, 3, 4], [0, 0, 5, 6]]
     np.testing.assert_array_equal(check_boxes([((1, 2), (3, 4)), ((5, 6), (0, 0))]), boxes)
     np.testing.assert_array_equal(check_boxes(Detections(boxes, [1, 2])), boxes)
-
-
-def test_check_patches_accepts_a_patch_set():
-    patches = np.zeros((2, 64, 64, 3), np.uint8)
-    assert check_patches(PatchSet(patches, [0, 1], ["a/b/c.png"] * 2), 64) is patches
 
 
 @pytest.mark.parametrize(
@@ -188,7 +172,7 @@ def test_check_patches_accepts_a_patch_set():
         ([[0, 0, math.nan, 1]], "must be finite"),
         ([[0, 0, math.inf, 1]], "must be finite"),
         ([[0, 0, 1, 1], [10, 10, 5, 20]], r"got \[10, 10, 5, 20\] in row 1; .* x \+ width"),
-        ([[10, 10, 20, 5]], "in row 0"),
+        (np.array([[10, 10, 5, 20]], np.uint8), "in row 0"),
     ],
 )
 def test_check_boxes_refuses(boxes, message):
@@ -207,28 +191,17 @@ def test_the_reason_why_an_array_cannot_be_converted_is_kept():
         assert isinstance(caught.value.__cause__, TypeError)
 
 
-def test_check_boxes_compares_unsigned_coordinates():
-    with pytest.raises(InvalidInputError, match="row 0"):
-        check_boxes(np.array([[10, 10, 5, 20]], np.uint8))
-
-
 def test_check_type():
     check_type(True, "n", int, "count them")
     with pytest.raises(InvalidInputError, match=r"^n must be a int, got 'a'; count them$"):
         check_type("a", "n", int, "count them")
 
 
-@pytest.mark.parametrize("value", [0, 1, 0.5, np.float32(0.5), np.int64(1)])
+@pytest.mark.parametrize("value", [0, 1, 0.5, np.float32(0.5), np.int64(1), Fraction(1, 4), 1e-300])
 def test_check_number_accepts_numbers_in_range(value):
     number = check_number(value, "fraction", low=0, high=1)
     assert type(number) is float
     assert number == value
-
-
-def test_check_number_accepts_fractions_but_no_decimals():
-    assert check_number(Fraction(30000, 1001), "fps") == 30000 / 1001
-    with pytest.raises(InvalidInputError, match="fps must be a number, finite; got Decimal"):
-        check_number(Decimal(30), "fps")
 
 
 def test_stored_numbers_are_those_of_python():
@@ -240,20 +213,11 @@ def test_stored_numbers_are_those_of_python():
         store_number(values, "c", low=2)
 
 
-@pytest.mark.parametrize("value", [True, np.bool_(True)])
-def test_check_bool_returns_a_bool(value):
-    assert check_bool(value, "mirror") is True
-
-
-@pytest.mark.parametrize("value", [1, "yes", None, np.int64(1)])
-def test_check_bool_refuses(value):
-    with pytest.raises(InvalidInputError, match="mirror must be True or False; got"):
-        check_bool(value, "mirror")
-
-
-def test_check_number_bounds():
-    assert check_number(1e300, "x") == 1e300
-    assert check_number(1e-300, "x", above=0) == 1e-300
+def test_check_bool():
+    assert check_bool(np.bool_(True), "mirror") is True
+    for value in (1, "yes", None, np.int64(1)):
+        with pytest.raises(InvalidInputError, match="mirror must be True or False; got"):
+            check_bool(value, "mirror")
 
 
 @pytest.mark.parametrize("value", [-0.01, 1.01, math.nan, math.inf, -math.inf, "0.5", None, True, [0.5], 1j])
@@ -263,41 +227,34 @@ def test_check_number_refuses(value):
         check_number(value, "fraction", low=0, high=1)
 
 
-def test_check_number_describes_an_open_bound():
-    with pytest.raises(InvalidInputError, match=r"fps must be a number, greater than 0; got 0$"):
-        check_number(0, "fps", above=0)
+@pytest.mark.parametrize(
+    ("value", "bounds", "expected"),
+    [
+        (0, {"above": 0}, "greater than 0; got 0"),
+        (math.inf, {}, "finite; got inf"),
+        (math.nan, {}, "finite; got nan"),
+        (Decimal(30), {}, r"finite; got Decimal\('30'\) \(Decimal\)"),
+    ],
+)
+def test_check_number_describes_the_bounds(value, bounds, expected):
+    with pytest.raises(InvalidInputError, match=f"fps must be a number, {expected}$"):
+        check_number(value, "fps", **bounds)
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_check_number_refuses_infinite_numbers(value):
-    with pytest.raises(InvalidInputError, match="threshold must be a number, finite"):
-        check_number(value, "threshold")
-
-
-@pytest.mark.parametrize("value", [1, 5, np.int8(3), np.uint64(4)])
-def test_check_integer_accepts_integers_in_range(value):
-    assert type(check_integer(value, "n", low=1, high=5)) is int
-
-
-@pytest.mark.parametrize("value", [0, 6, 2.0, "2", True, None, math.nan])
-def test_check_integer_refuses(value):
-    with pytest.raises(InvalidInputError, match="n must be an integer from 1 to 5; got"):
-        check_integer(value, "n", low=1, high=5)
-
-
-def test_check_integer_without_an_upper_bound():
+def test_check_integer():
+    for value in (1, 5, np.int8(3), np.uint64(4)):
+        assert type(check_integer(value, "n", low=1, high=5)) is int
     assert check_integer(10**12, "n", low=1) == 10**12
+    for value in (0, 6, 2.0, "2", True, None, math.nan):
+        with pytest.raises(InvalidInputError, match="n must be an integer from 1 to 5; got"):
+            check_integer(value, "n", low=1, high=5)
     with pytest.raises(InvalidInputError, match=r"n must be an integer at least 1; got -3$"):
         check_integer(-3, "n", low=1)
-
-
-def test_check_choice():
-    check_choice("a", "mode", ("a", "b"))
-    check_choice(0, "mode", (0, "b"))
 
 
 @pytest.mark.parametrize("value", ["c", None, ["a"], {}, np.zeros(3), np.array(["a", "b"])])
 @pytest.mark.parametrize("choices", [("a", "b"), {"a": 1, "b": 2}])
 def test_check_choice_lists_the_choices(value, choices):
+    check_choice("a", "mode", choices)
     with pytest.raises(InvalidInputError, match=r"mode must be one of 'a', 'b'; got"):
         check_choice(value, "mode", choices)

@@ -39,12 +39,12 @@ def video_report(frames, **options):
     return VideoReport(frames=frames, **(defaults | options))
 
 
-def write_report(folder, frames, **options):
-    """Write a report of the tracks of each frame; return its text."""
+def write_report(folder, frames, *, events=None, pictures=(), report=None, **options):
+    """Write a report of the tracks of each frame, with changes of the `VideoReport`; return its text."""
     writer = ReportWriter(folder / "report.html", **options)
     for index, tracks in enumerate(frames):
         writer.table.append(index, index / FPS, tracks)
-    writer.finish(video_report(len(frames)))
+    writer.finish(video_report(len(frames), **(report or {})), events=events, pictures=pictures)
     return (folder / "report.html").read_text(encoding="utf-8")
 
 

@@ -137,16 +137,9 @@ def test_headway_in_seconds_needs_the_own_speed():
 
 def test_the_own_speed_tells_standing_from_moving_vehicles():
     slow = next(event for event in events_of("passing", 0) if event.kind == "overtaken")
-    (parked,) = (
-        event
-        for event in events_of("passing", 0, own_speed_mps=slow.closing_mps)
-        if event.track_id == slow.track_id and event.side == slow.side
-    )
-    assert parked.kind == "passed"
-    (oncoming,) = (
-        event for event in events_of("passing", 0, own_speed_mps=0.0) if event.track_id == slow.track_id
-    )
-    assert oncoming.kind == "met"
+    for own_speed, kind in ((slow.closing_mps, "passed"), (0.0, "met")):
+        found = events_of("passing", 0, own_speed_mps=own_speed)
+        assert [event.kind for event in found if event.track_id == slow.track_id and event.side] == [kind]
 
 
 def test_speeds_over_ground_where_the_own_speed_is_known():
@@ -165,12 +158,14 @@ def test_speeds_over_ground_where_the_own_speed_is_known():
     assert unknown == events_of("closing", 0)
 
 
-def test_an_event_is_described_in_units():
+def test_an_event_is_a_value_with_a_description():
     event = Event(kind="closest_approach", track_id=3, frame=10, start_frame=10, end_frame=10, time_s=0.4,
-                  distance_m=8.0, distance_std_m=1.0)  # fmt: skip
-    text = "vehicle 3 closest approach, distance 26.2 ± 3.3 ft"
-    assert event.text(UNITS["imperial"], with_time=False) == text
-    assert event.text(UNITS["imperial"]) == f"0.4 s: {text}"
+                  distance_m=8.0, distance_std_m=1.0, side="left")  # fmt: skip
+    text = "vehicle 3 closest approach, on the left, distance"
+    assert event.text(UNITS["imperial"], with_time=False) == f"{text} 26.2 ± 3.3 ft"
+    assert str(event) == f"0.4 s: {text} 8.0 ± 1.0 m"
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        event.frame = 3
 
 
 def test_what_is_stated_is_known_and_in_order():
@@ -191,10 +186,9 @@ def test_what_is_stated_is_known_and_in_order():
 
 def test_the_camera_changing_lanes_is_no_cut_in():
     table = simulated("cut_in", 0)[1]
-    (event,) = listed(find_events(table, fps=FPS, shape=SHAPE), "cut_in")
-    mover = next(track for track in track_histories(table) if any(e.track_id == track.id for e in
-                 find_events(table, fps=FPS, shape=SHAPE) if e.kind == "cut_in"))  # fmt: skip
-    shift = np.array([200.0, 0, 200, 0]) * (1 if event[1] == "right" else -1)
+    (event,) = (each for each in find_events(table, fps=FPS, shape=SHAPE) if each.kind == "cut_in")
+    (mover,) = (track for track in track_histories(table) if track.id == event.track_id)
+    shift = np.array([200.0, 0, 200, 0]) * (1 if event.side == "right" else -1)
     columns = {name: np.tile(values, 2) for name, values in mover.columns.items()}
     numbers, boxes = np.repeat([mover.id, 99], len(mover.frames)), [*mover.boxes, *(mover.boxes + shift)]
     both = TrackTable(np.tile(mover.frames, 2), numbers, boxes, **columns)
@@ -230,13 +224,6 @@ def test_a_camera_of_another_size_is_scaled_or_refused():
         find_events(table, fps=FPS, shape=(500, 500), camera=large)
 
 
-def test_no_tracks_give_no_events():
-    assert find_events(TrackTable(), fps=25, shape=(720, 1280)) == ()
-    table = TrackTable()
-    table.append(0, None, [])
-    assert find_events(table, fps=25, shape=(720, 1280)) == ()
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -249,24 +236,14 @@ def test_no_tracks_give_no_events():
     ],
 )
 def test_bad_arguments_are_refused(options, message):
-    table = simulated("closing", 0)[1]
+    assert find_events(TrackTable(), fps=FPS, shape=SHAPE) == ()
     with pytest.raises(InvalidInputError, match=message):
-        find_events(table, **({"fps": FPS, "shape": SHAPE} | options))
-
-
-def test_events_are_values():
-    event = Event(kind="met", track_id=1, frame=10, start_frame=5, end_frame=10, time_s=0.4, side="left")
-    assert str(event) == "0.4 s: vehicle 1 met (oncoming), on the left"
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        event.frame = 3
+        find_events(simulated("closing", 0)[1], **({"fps": FPS, "shape": SHAPE} | options))
 
 
 def test_no_vehicle_is_followed_while_it_is_not_seen():
-    def box(frame):
-        return [620 - 0.1 * (frame % 2), 380, 660, 420]
-
     frames = np.array([*range(8), *range(95, 103)])
-    boxes = np.array([box(frame) for frame in frames], float)
+    boxes = np.array([[620 - 0.1 * (frame % 2), 380, 660, 420] for frame in frames])
     known = {"distance_m": np.full(16, 20.0), "distance_std_m": np.ones(16)}
     found = find_events(TrackTable(frames, np.ones(16, int), boxes, **known), fps=25, shape=SHAPE)
     assert not listed(found, "headway")

@@ -42,13 +42,12 @@ def test_no_piece_of_a_page_holds_the_whole_video(tmp_path, monkeypatch):
     monkeypatch.setattr(page, "_CHUNK", 3000)
     video = tmp_path / "video.mp4"
     video.write_bytes(bytes(90_000))
-    sizes = []
-    render = writer.render_page
-    monkeypatch.setattr(
-        writer,
-        "render_page",
-        lambda *args, **options: (sizes.append(len(piece)) or piece for piece in render(*args, **options)),
-    )
+    sizes, render = [], writer.render_page
+
+    def watch(*args, **options):
+        return (sizes.append(len(piece)) or piece for piece in render(*args, **options))
+
+    monkeypatch.setattr(writer, "render_page", watch)
     write_report(tmp_path, FRAMES, video=video)
     assert sizes.count(4000) >= 30
     assert max(sizes) < 20_000
@@ -62,29 +61,25 @@ def test_matroska_comes_with_a_note(tmp_path):
     assert "Not every browser plays Matroska" in text
 
 
-def test_rejects_paths_that_cannot_be_written(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"path must be a file name, got 3; pass a path"):
-        ReportWriter(3)
-    with pytest.raises(InvalidInputError, match=r"video must be a file name, got 3"):
-        ReportWriter(tmp_path / "report.html", video=3)
-    with pytest.raises(InvalidInputError, match=r"source must be a file name, got \['a'\]"):
-        ReportWriter(tmp_path / "report.html", source=["a"])
-    with pytest.raises(
-        InvalidInputError, match=r"path must end in .html or .htm, got 'report.pdf'; write 'report.html'"
-    ):
-        ReportWriter(tmp_path / "report.pdf")
-    with pytest.raises(InvalidInputError, match="path needs an existing folder"):
-        ReportWriter(tmp_path / "missing" / "report.html")
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"path": 3}, "path must be a file name, got 3; pass a path"),
+        ({"video": 3}, "video must be a file name, got 3"),
+        ({"source": ["a"]}, r"source must be a file name, got \['a'\]"),
+        ({"path": "report.pdf"}, "path must end in .html or .htm, got 'report.pdf'; write 'report.html'"),
+        ({"path": "missing/report.html"}, "path needs an existing folder"),
+        ({"path": "folder.html"}, "path must be a file, got the folder"),
+        ({"video": "./page.html"}, "is also the video; choose another name"),
+        ({"source": "page.html"}, "is also the source; choose another name"),
+        ({"embed_limit": -1}, "embed_limit must be an integer at least 0"),
+    ],
+)
+def test_bad_arguments_are_refused(tmp_path, monkeypatch, options, message):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "folder.html").mkdir()
-    with pytest.raises(InvalidInputError, match="path must be a file, got the folder"):
-        ReportWriter(tmp_path / "folder.html")
-    target = tmp_path / "page.html"
-    with pytest.raises(InvalidInputError, match=r"is also the video; choose another name"):
-        ReportWriter(target, video=tmp_path / "." / "page.html")
-    with pytest.raises(InvalidInputError, match=r"is also the source; choose another name"):
-        ReportWriter(target, source=target)
-    with pytest.raises(InvalidInputError, match="embed_limit must be an integer at least 0"):
-        ReportWriter(target, embed_limit=-1)
+    with pytest.raises(InvalidInputError, match=message):
+        ReportWriter(**{"path": "page.html", **options})
     assert list(tmp_path.iterdir()) == [tmp_path / "folder.html"]
 
 

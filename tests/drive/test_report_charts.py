@@ -14,6 +14,7 @@ from vehicle_detection.drive.report_charts import (
     _assign_rows,
     _separate_labels,
     chart,
+    format_time,
 )
 
 
@@ -66,7 +67,7 @@ def test_labels_do_not_overlap(places):
 
 def test_a_label_has_the_color_of_its_track():
     labels = [Label(50.0, 40.0, 9)]
-    svg = chart("", TimeAxis(50, 25.0), ValueAxis.covering(0, 10, 150), label="Lines", track_labels=labels)
+    svg = chart("", TimeAxis(50, 25.0), ValueAxis.covering(0, 10, 150), label="Lines", names=labels)
     assert 'class="track-name c1"' in svg
 
 
@@ -77,3 +78,12 @@ def test_tracks_that_share_a_row_do_not_overlap(frames):
     for (one, row), (other, same) in combinations(zip(tracks, rows), 2):
         assert row != same or one.last < other.first
     assert sorted(set(rows)) == list(range(len(set(rows))))
+
+
+@given(st.floats(0, 1e5))
+def test_times_carry_when_they_are_rounded(seconds):
+    text = format_time(seconds)
+    *hours, minutes, rest = text.split(":")
+    assert float(rest) < 60
+    total = sum(int(part) * unit for part, unit in zip([*hours[:1], minutes][::-1], (60, 3600)))
+    assert total + float(rest) == pytest.approx(seconds, abs=0.051)

@@ -100,11 +100,9 @@ class TestPage:
         assert not set(title) & set("<>\"'")
         assert html.unescape(title) == f"Vehicles in {name}.mp4"
 
-    def test_bytes_of_a_file_name_that_are_not_utf8_are_replaced(self, tmp_path):
+    def test_passwords_and_bytes_that_are_not_utf8_are_replaced(self, tmp_path):
         name = b"road \xff.mp4".decode("utf-8", "surrogateescape")
-        assert "Vehicles in road ?.mp4" in write_report(tmp_path, FRAMES, source=name)
-
-    def test_a_url_is_shown_without_its_password(self, tmp_path):
+        assert "Vehicles in road ?.mp4" in write_report(tmp_path, FRAMES[:1], source=name)
         text = write_report(tmp_path, FRAMES[:1], source="rtsp://anna:se@cret@camera")
         assert "Vehicles in ***@camera" in text
         assert "anna" not in text
@@ -134,12 +132,10 @@ class TestPage:
     def test_counts_are_those_of_the_run(self, tmp_path):
         text = write_report(tmp_path, FRAMES)
         counts = dict(re.findall(r"<dt>([^<]*)</dt><dd>([^<]*)</dd>", text))
-        assert counts["Vehicles"] == "2"
-        assert counts["Frames"] == "50"
-        assert counts["Length"] == "0:02.0"
-        assert counts["Most at once"] == "2"
-        assert counts["Longest track"] == "#1, 2.0 s"
-        assert counts["Nearest"] == "21 \N{PLUS-MINUS SIGN} 2 m, #1"
+        assert counts.items() >= {
+            "Vehicles": "2", "Frames": "50", "Length": "0:02.0", "Most at once": "2",
+            "Longest track": "#1, 2.0 s", "Nearest": "21 \N{PLUS-MINUS SIGN} 2 m, #1",
+        }.items()  # fmt: skip
         rows = re.findall(r"<tr>(<th scope=\"row\">.*?)</tr>", text, re.DOTALL)
         cells = [re.findall(r"<t[hd].*?>(.*?)</t[hd]>", row) for row in rows]
         assert [re.sub("<.*?>", "", cell) for cell in cells[2]] == [
@@ -151,31 +147,17 @@ class TestPage:
 
     def test_notices(self, tmp_path):
         assert '<ul class="notices">' not in write_report(tmp_path, FRAMES)
-        writer = ReportWriter(tmp_path / "report.html", detector=SimpleNamespace(camera=Camera.dashcam()))
-        writer.table.append(0, 0.0, [track(1)])
-        writer.finish(video_report(1, damage="<a>.mp4 is damaged: 3 frames are missing", dropped=2))
-        text = (tmp_path / "report.html").read_text(encoding="utf-8")
+        detector, source = SimpleNamespace(camera=Camera.dashcam()), tmp_path / "<a>.mp4"
+        report = {"damage": f"{source} is damaged: 3 frames are missing", "dropped": 2}
+        text = write_report(tmp_path, [[track(1)]], detector=detector, source=source, report=report)
         (notices,) = re.findall(r'<ul class="notices">(.*?)</ul>', text, re.DOTALL)
         assert re.findall(r"<li>(.*)</li>", notices) == [
             "&lt;a&gt;.mp4 is damaged: 3 frames are missing.",
             "2 frames of the live source were dropped.",
             "The lens is unknown: distances and speeds may be wrong by a factor of 2 or more.",
         ]
-
-    def test_notices_leave_out_the_folder_of_the_source(self, tmp_path):
-        source = tmp_path / "road" / "drive.mp4"
-        writer = ReportWriter(tmp_path / "report.html", source=source)
-        writer.finish(video_report(0, damage=f"{source} is incomplete"))
-        assert "<li>drive.mp4 is incomplete.</li>" in (tmp_path / "report.html").read_text(encoding="utf-8")
-
-    def test_an_unknown_lens_matters_for_distances_only(self, tmp_path):
-        detector = SimpleNamespace(camera=Camera.dashcam())
         text = write_report(tmp_path, [[track(1, distance=None, speed=None)]], detector=detector)
         assert "The lens is unknown" not in text
-
-    def test_small_standard_errors_keep_a_decimal(self, tmp_path):
-        text = write_report(tmp_path, [[track(1, distance=5.23, distance_std=0.36)]] * 5)
-        assert "<dd>5.2 \N{PLUS-MINUS SIGN} 0.4 m, #1</dd>" in text
 
     def test_units(self, tmp_path):
         frames = [[track(1, distance=30.48, speed=10.0)] for _ in range(5)]
@@ -201,9 +183,7 @@ class TestPage:
             [track(3, distance=10 + index, speed=-1.25)] if index not in (4, 5) else [] for index in range(9)
         ]
         data = json.loads(script_data(write_report(tmp_path, frames)))
-        assert data["fps"] == FPS
-        assert data["frames"] == 9
-        assert data["step"] == 1
+        assert (data["fps"], data["frames"], data["step"]) == (FPS, 9, 1)
         assert data["tracks"] == [
             {
                 "id": 3,
@@ -216,15 +196,14 @@ class TestPage:
             }
         ]
 
-    def test_distances_with_large_standard_errors_are_marked(self, tmp_path):
-        frames = [[track(1, distance=20.0, distance_std=std)] for std in (3.0, 4.5, 9.0)]
-        data = json.loads(script_data(write_report(tmp_path, frames)))
-        assert data["tracks"][0]["rough"] == [0, 1, 1]
-
-    def test_speeds_with_large_standard_errors_are_hidden(self, tmp_path):
-        frames = [[track(1, speed=9.0, speed_std=3.5 - index)] for index in range(3)]
-        data = json.loads(script_data(write_report(tmp_path, frames)))
-        assert data["tracks"][0]["speed"] == [None, 32.4, 32.4]
+    def test_large_standard_errors_mark_distances_and_hide_speeds(self, tmp_path):
+        stds = ((3.0, 3.5), (4.5, 2.5), (9.0, 1.5))
+        frames = [
+            [track(1, distance=20.0, distance_std=first, speed=9.0, speed_std=second)]
+            for first, second in stds
+        ]
+        (found,) = json.loads(script_data(write_report(tmp_path, frames)))["tracks"]
+        assert (found["rough"], found["speed"]) == ([0, 1, 1], [None, 32.4, 32.4])
 
     @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan, 1e300, np.float32(math.inf)])
     def test_infinite_and_absurd_numbers_are_unknown(self, tmp_path, value):
@@ -399,11 +378,7 @@ def test_events_and_counts_are_listed_with_buttons_that_seek(tmp_path):
               distance_m=12.5, distance_std_m=1.5),
         Event(kind="overtaken", track_id=1, frame=40, start_frame=30, end_frame=40, time_s=1.6, side="right"),
     ]  # fmt: skip
-    writer = ReportWriter(tmp_path / "report.html")
-    for index, tracks in enumerate(FRAMES):
-        writer.table.append(index, index / FPS, tracks)
-    writer.finish(video_report(len(FRAMES)), events=events)
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    page = write_report(tmp_path, FRAMES, events=events)
     parser = StrictParser(page)
     markers = [each for each in parser.all("g") if "vehicle" in each.get("aria-label", "")]
     assert [marker["data-frame"] for marker in markers] == ["12", "40"]
@@ -417,24 +392,16 @@ def test_events_and_counts_are_listed_with_buttons_that_seek(tmp_path):
 def test_events_are_in_the_units_of_the_page(tmp_path):
     event = Event(kind="met", track_id=2, frame=12, start_frame=8, end_frame=14, time_s=0.48, side="left",
                   distance_m=12.5, distance_std_m=1.5, closing_std_mps=1.0, speed_mps=-20.0)  # fmt: skip
-    writer = ReportWriter(tmp_path / "report.html", units="imperial")
-    for index, tracks in enumerate(FRAMES):
-        writer.table.append(index, index / FPS, tracks)
-    writer.finish(video_report(len(FRAMES)), events=[event])
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    page = write_report(tmp_path, FRAMES, events=[event], units="imperial")
     assert "<td>41.0 ± 4.9 ft</td>\n<td>45 ± 2 mph, oncoming</td>" in page
     assert "distance 41.0 ± 4.9 ft: show in the video" in page
     assert "12.5 ± 1.5 m" not in page
 
 
 def test_pictures_are_part_of_the_page(tmp_path):
-    writer = ReportWriter(tmp_path / "report.html")
-    for index, tracks in enumerate(FRAMES):
-        writer.table.append(index, index / FPS, tracks)
     image = np.full((180, 320, 3), (200, 90, 0), np.uint8)
     picture = TrackPicture(2, 25, image, "score 3.10, template 1: <margin> 0.50")
-    writer.finish(video_report(len(FRAMES)), pictures=[picture])
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    page = write_report(tmp_path, FRAMES, pictures=[picture])
     (shown,) = (each for each in StrictParser(page).all("img") if each["class"] == "why")
     data = base64.b64decode(shown["src"].removeprefix("data:image/jpeg;base64,"))
     decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
@@ -449,11 +416,7 @@ def test_a_page_without_certain_events_says_so(tmp_path):
 
 
 def test_minutes_are_buttons_that_seek_and_come_before_the_tracks(tmp_path):
-    writer = ReportWriter(tmp_path / "report.html")
-    for index in range(2 * 60 * FPS + 1):
-        writer.table.append(index, index / FPS, FRAMES[0])
-    writer.finish(video_report(2 * 60 * FPS + 1), events=[])
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    page = write_report(tmp_path, FRAMES[:1] * (2 * 60 * FPS + 1), events=[])
     buttons = [
         each for each in StrictParser(page).all("button") if re.match(r"\d:\d\d: show", each["aria-label"])
     ]

@@ -64,12 +64,9 @@ def test_segments_of_two_cameras_and_two_drives():
     ]
 
 
-def test_folders_are_different_trips():
+def test_folders_are_different_trips_and_clocks_may_drift_by_a_second():
     names = ["a/20260131_081500.mp4", "b/20260131_081600.mp4"]
     assert [files for _, files in summary(names)] == [[names[0]], [names[1]]]
-
-
-def test_clocks_that_drift_by_a_second():
     names = [f"20260131_08{time}_F.mp4" for time in ("1500", "1601", "1701", "1800", "1859")]
     assert summary(names) == [("front", names)]
 
@@ -100,6 +97,7 @@ def test_numbers_without_times():
         ("unknown", ["GX010008.MP4"]),
     ]
     assert len(find_trips(["drive.mp4", "walk.mp4"])) == 2
+    assert len(find_trips(["drive1.mp4", "drive2.mp4", "drive3.mp4"])) == 3
 
 
 @pytest.mark.parametrize(
@@ -121,20 +119,12 @@ def test_numbers_with_modification_times(tmp_path, ends, trips):
     assert [len(trip.files) for trip in found] == trips
 
 
-def test_other_numbers_do_not_make_a_trip():
-    assert len(find_trips(["drive1.mp4", "drive2.mp4", "drive3.mp4"])) == 3
-
-
 def test_paths_and_urls_keep_their_type():
     (trip,) = find_trips([Path("a/20260131_081500.mp4")])
     assert trip.files == (Path("a/20260131_081500.mp4"),)
     (trip,) = find_trips(["s3://bucket/a/20260131_081500.mp4"])
     assert trip.files == ("s3://bucket/a/20260131_081500.mp4",)
     assert str(trip) == "1 file"
-
-
-def test_hidden_files_are_no_videos():
-    assert [is_video_file(Path(name)) for name in ("a.MP4", "._a.mp4", "a.thm")] == [True, False, False]
 
 
 def test_the_query_of_a_url_tells_no_time():
@@ -195,19 +185,16 @@ def card(tmp_path_factory):
     return folder
 
 
-def test_the_segments_of_a_pattern_become_one_video(card):
+def test_the_segments_of_a_pattern_become_one_video_and_several_trips_are_listed(card):
     with open_trip(str(card / "*F.mp4")) as source:
         assert [index for index, _, _ in source] == list(range(16))
-
-
-def test_several_trips_are_listed(card):
-    with pytest.raises(
-        InvalidInputError, match=r"2 trips \(front, 2 files from 20260131_081500_F.mp4; rear,"
-    ):
+    message = r"2 trips \(front, 2 files from 20260131_081500_F.mp4; rear,"
+    with pytest.raises(InvalidInputError, match=message):
         open_trip(card)
 
 
 def test_other_sources_are_those_of_open_source(card):
+    assert [is_video_file(Path(name)) for name in ("a.MP4", "._a.mp4", "a.thm")] == [True, False, False]
     file = next(card.iterdir())
     with open_trip(file) as source, open_trip(source) as same:
         assert source is same

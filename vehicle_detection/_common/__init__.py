@@ -28,6 +28,7 @@ from vehicle_detection._common.files import (
     check_suffix,
     check_target,
     is_hidden,
+    open_locked,
     temporary_folder,
     write_text,
 )

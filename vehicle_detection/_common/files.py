@@ -167,7 +167,7 @@ def _open_part(path: Path, stack: contextlib.ExitStack) -> Path:
         for number in range(_MAX_PARTS):
             part = path.parent / f"{prefix}{number}.part{path.suffix}"
             try:
-                handle = _open_locked(part)
+                handle = open_locked(part)
             except BlockingIOError:
                 continue
             if handle is None:
@@ -179,8 +179,8 @@ def _open_part(path: Path, stack: contextlib.ExitStack) -> Path:
     return Path(temporary)
 
 
-def _open_locked(part: Path) -> int | None:
-    """Open and lock a new or abandoned file; None if the file system has no locks.
+def open_locked(part: Path) -> int | None:
+    """Open and lock a new or abandoned file, not on Windows; None if the file system has no locks.
 
     Raises BlockingIOError if another process uses the file, or it is not a file.
     """

@@ -1,7 +1,6 @@
 from .batch import BatchReport, run_batch
-from .batch_records import BatchStatus, batch_status, batch_summary, with_source
+from .batch_store import BatchStatus, batch_status, batch_summary, with_source
 from .counts import COUNTED, MinuteCounts, VehicleCounts, count_vehicles
-from .dask_cluster import open_dask
 from .events import (
     EVENT_COLUMNS,
     EVENT_SUFFIXES,
@@ -11,12 +10,12 @@ from .events import (
     find_events,
     write_events,
 )
-from .explained_tracks import explain_tracks
 from .own_speed import OwnSpeed, own_speeds, read_own_speed
-from .report import ReportWriter
+from .report import ReportWriter, explain_tracks
 from .report_page import TrackPicture
 from .subtitles import SUBTITLE_SUFFIXES, write_subtitles
 from .trips import Trip, find_trips, open_trip
+from .worker_pool import open_dask
 
 __all__ = [
     "COUNTED",

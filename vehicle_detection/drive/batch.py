@@ -42,17 +42,18 @@ from vehicle_detection.drive.batch_plan import (
     trip_digest,
     trip_id,
 )
-from vehicle_detection.drive.batch_records import (
+from vehicle_detection.drive.batch_store import (
     COUNTS,
     DONE,
     ERROR,
     FAILED,
+    Store,
     is_complete,
+    open_store,
     read_records,
     record_keys,
     write_record,
 )
-from vehicle_detection.drive.batch_store import Store, open_store
 from vehicle_detection.drive.batch_trip import (
     BUSY,
     RECORDED,

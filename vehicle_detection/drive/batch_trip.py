@@ -27,17 +27,18 @@ from vehicle_detection.annotator import Annotator
 from vehicle_detection.camera import open_camera
 from vehicle_detection.detector import VehicleDetector, load_model
 from vehicle_detection.drive.batch_plan import fingerprint_of
-from vehicle_detection.drive.batch_records import (
+from vehicle_detection.drive.batch_store import (
     DONE,
     ERROR,
     FAILED,
+    Store,
     is_complete,
+    open_store,
     read_record,
     read_records,
     record_path,
     write_record,
 )
-from vehicle_detection.drive.batch_store import Store, open_store
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VehicleDetectionError, VideoError
 from vehicle_detection.formats import DIGITS, track_records
 from vehicle_detection.network import Device
