@@ -84,33 +84,23 @@ class TrackTable:
 
     ``table["score"]`` is a column, named as in the files; ``table[rows]`` selects rows by an index, a slice,
     a mask or a list. Iterating yields the key and the table of each frame. A table of a video grows by
-    `append`; other tables are complete and checked when they are built.
+    `append`, which sets `first_time`, the time of the first frame in seconds, None if unknown.
 
     Parameters
     ----------
     frame
         Frame key of each row: all int (counted from 0) or all str (the image's file name).
     track_id
-        ``(N,)`` numbers of the vehicles within the video, -1 for none; None if no box has one.
+        ``(N,)`` numbers of the vehicles within the video, each at most once a frame; -1 for none.
     boxes
         ``(N, 4)`` ``[x1, y1, x2, y2]`` in half-open pixels.
     frame_keys
-        All frames in order, including those without a box; the frames of the rows are added.
+        All frames, including those without a box; the frames of the rows are added.
     **columns
         Other columns, ``(N,)`` or None: ``score``, ``confidence``, ``distance_m``, ``distance_std_m``,
         ``speed_mps`` and ``speed_std_mps`` of tracks and detections, NaN where a value is unknown; and
         ``occluded`` (0 visible, 1 partly, 2 largely hidden), ``truncated`` (fraction outside the image) and
         ``ignore`` (not scored; with track -1 a region) of labels. A table without ``score`` holds labels.
-
-    Attributes
-    ----------
-    first_time
-        Time of the first appended frame in the source, in seconds; None if unknown.
-
-    Raises
-    ------
-    InvalidInputError
-        If columns differ in length or hold invalid values, or a track occurs twice in a frame.
 
     Examples
     --------
@@ -179,15 +169,14 @@ class TrackTable:
         for key, found in detections.items():
             check_type(found, f"detections[{key!r}]", Detections, "pass Detections(boxes, scores)")
         parts = [Detections.empty(), *detections.values()]
-        confidences = [
-            np.full(len(found), np.nan) if found.confidences is None else found.confidences for found in parts
-        ]
+        unknown = [np.full(len(found), np.nan) for found in parts]
+        known = [gap if each.confidences is None else each.confidences for each, gap in zip(parts, unknown)]
         return cls(
             [key for key, found in detections.items() for _ in range(len(found))],
             None,
             np.concatenate([found.boxes for found in parts]),
             score=np.concatenate([found.scores for found in parts]),
-            confidence=np.concatenate(confidences),
+            confidence=np.concatenate(known),
             frame_keys=tuple(detections),
         )
 
@@ -215,18 +204,12 @@ class TrackTable:
         So ``pandas.read_csv`` of a file that `write_tracks` wrote is such a table. A missing track is -1, and
         missing occlusion, truncation and `ignore` are 0. As in `read_labels`, a column ``class``, ``label``
         or ``category`` of names selects vehicles: those of `classes`, or car, van, truck, bus and vehicle.
-
-        Raises
-        ------
-        InvalidInputError
-            If a column is missing or holds something else, or no class is that of vehicles.
         """
-        given: object = table
-        if not hasattr(given, "iloc") or not hasattr(given, "columns"):
-            remedy = "; convert it with table.to_pandas()" if hasattr(given, "to_pandas") else ""
+        if not hasattr(table, "iloc") or not hasattr(table, "columns"):
+            remedy = "; convert it with table.to_pandas()" if hasattr(table, "to_pandas") else ""
             raise InvalidInputError(
                 f"table must be a pandas.DataFrame with the columns frame, {', '.join(CORNERS)}; "
-                f"got {describe(given)}{remedy}"
+                f"got {describe(table)}{remedy}"
             )
         names = list(table.columns)
         twice = next((name for name in names if names.count(name) > 1), None)
@@ -237,25 +220,16 @@ class TrackTable:
             for name in names
         }
         places = [f"table row {row}" for row in range(len(table))]
-        return cls(**parse_cells(cells, "table", places, classes=classes, error=InvalidInputError)[0])
+        try:
+            return cls(**parse_cells(cells, "table", places, classes)[0])
+        except DatasetError as error:
+            raise InvalidInputError(str(error)) from None
 
     def append(self, frame: Any, time: float | None = None, tracks: Iterable[Any] = ()) -> None:
         """Add the shown tracks of the next frame.
 
-        Parameters
-        ----------
-        frame
-            :class:`FrameResult` of the frame, or its number, counted from 0; numbers ascend, and those of
-            frames that a live source dropped are left out.
-        time
-            Time of the frame in the source in seconds; None if unknown.
-        tracks
-            `Track` objects; those that are not shown are skipped.
-
-        Raises
-        ------
-        InvalidInputError
-            If a frame is repeated, two tracks have the same id, or an argument is malformed.
+        `frame` is a :class:`FrameResult`, or its number, counted from 0 and ascending, with its `time` in the
+        source in seconds, if known, and its `tracks`; those that are not shown are skipped.
         """
         if is_result(frame):
             frame, time, tracks = frame.index, getattr(frame, "time", None), frame.tracks
@@ -449,10 +423,8 @@ def _check_column(values: ArrayLike | None, name: str, rows: int) -> NDArray[Any
     given = filled if values is None else check_array(values, name)
     if given.size == 0:
         given = given.reshape(-1).astype(filled.dtype)
-    if (
-        given.shape != (rows,)
-        or given.dtype.kind not in {"b": "b", "i": "iub", "f": "iufb"}[filled.dtype.kind]
-    ):
+    kinds = {"b": "b", "i": "iub", "f": "iufb"}[filled.dtype.kind]
+    if given.shape != (rows,) or given.dtype.kind not in kinds:
         raise InvalidInputError(
             f"{name} must be one value for each of the {rows} boxes, got {describe(given)}"
         )
@@ -466,30 +438,27 @@ def parse_cells(
     cells: Mapping[str, Sequence[Any]],
     source: object,
     places: Sequence[str],
-    *,
     classes: Collection[str] | None = None,
-    error: type[Exception] = DatasetError,
 ) -> tuple[dict[str, Any], list[str]]:
     """Arguments of `TrackTable` from cells, which are text or values, by the name of their column.
 
-    `places` states where each row is, for messages about `source`. Rows of other classes than vehicles are
-    left out; the places of the others are returned, too.
+    `places` states where each row is, for messages. Only vehicles are kept; returns their places, too.
     """
     missing = [name for name in ("frame", *CORNERS) if name not in cells]
     if missing:
         found = shorten(", ".join(map(str, cells)), 300) or "an empty file"
-        raise error(f"{source} lacks the columns {', '.join(missing)}; found {found}")
-    keys = _parse_frames(cells["frame"], places, error)
+        raise DatasetError(f"{source} lacks the columns {', '.join(missing)}; found {found}")
+    keys = _parse_frames(cells["frame"], places)
     scores = cells.get("score")
     predicted = scores is not None and (not scores or not all(map(_is_missing, scores)))
-    vehicles, lookalike = _vehicle_rows(cells, source, classes, predicted, error)
+    vehicles, lookalike = _vehicle_rows(cells, source, classes, predicted)
     rows = np.flatnonzero(vehicles).tolist()
     where = [places[row] for row in rows]
     columns: dict[str, Any] = {}
     for name in (*CORNERS, *_COLUMNS):
         used = "track" if name == "track_id" and name not in cells else name
         if used in cells and (name != "score" or predicted):
-            columns[name] = _parse_numbers(used, [cells[used][row] for row in rows], where, error)
+            columns[name] = _parse_numbers(used, [cells[used][row] for row in rows], where)
     if lookalike.any():
         columns["ignore"] = columns.get("ignore", False) | lookalike[rows]
     columns["boxes"] = np.stack([columns.pop(name) for name in CORNERS], axis=1)
@@ -501,20 +470,22 @@ def _is_missing(cell: Any) -> bool:
     return cell is None or str(cell).strip().lower() in ("", "nan")
 
 
-def _parse_frames(cells: Sequence[Any], places: Sequence[str], error: type[Exception]) -> list[FrameKey]:
+def _parse_frames(cells: Sequence[Any], places: Sequence[str]) -> list[FrameKey]:
     """Frames as numbers or names; whole numbers that a concatenation has made floats are numbers again."""
     keys: list[FrameKey] = []
     for cell, place in zip(cells, places, strict=True):
         if cell in (None, "") or cell != cell:  # NaN; a frame may be called "nan"
-            raise error(f"{place}: frame is empty; enter its number from 0 or its file name")
+            raise DatasetError(f"{place}: frame is empty; enter its number from 0 or its file name")
         if isinstance(cell, str):
             keys.append(cell)
         elif isinstance(cell, bool) or not 0 <= cell <= _MAX_ID or cell != int(cell):
-            raise error(f"{place}: frame must be a whole number from 0 or a name, got {describe(cell)}")
+            raise DatasetError(
+                f"{place}: frame must be a whole number from 0 or a name, got {describe(cell)}"
+            )
         else:
             keys.append(int(cell))
         if type(keys[-1]) is not type(keys[0]):
-            raise error(f"{place}: frame must be a number in every row, or a name in every row")
+            raise DatasetError(f"{place}: frame must be a number in every row, or a name in every row")
     return keys
 
 
@@ -523,7 +494,6 @@ def _vehicle_rows(
     source: object,
     classes: Collection[str] | None,
     predicted: bool,
-    error: type[Exception],
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Mark the rows to keep, and the labels of lookalikes among them, by the columns of classes."""
     count = len(cells["frame"])
@@ -534,29 +504,25 @@ def _vehicle_rows(
     if not found or any(re.fullmatch(r"[-\d.]+|true|false", name) for name in found):
         return np.ones(count, np.bool_), np.zeros(count, np.bool_)
     wanted = VEHICLE_CLASSES if classes is None else classes
-    check_classes(source, found, wanted, error=error)
+    check_classes(source, found, wanted)
     vehicles = np.array([name in wanted for name in names])
     lookalike = ~vehicles & np.isin(names, LOOKALIKE_CLASSES) & (not predicted)
     return vehicles | lookalike, lookalike
 
 
 def check_classes(
-    source: object,
-    found: Collection[str],
-    wanted: Collection[str],
-    kind: str = "class",
-    error: type[Exception] = DatasetError,
+    source: object, found: Collection[str], wanted: Collection[str], kind: str = "class"
 ) -> None:
     """Refuse a file in which no class is that of vehicles: it would have no box."""
     if not any(name in wanted for name in found):
         listed = shorten(", ".join(map(repr, sorted(found))), 300) or "none"
-        raise error(
+        raise DatasetError(
             f"{source} has no {kind} among {', '.join(sorted(wanted))}; found {listed}; "
             "name those of vehicles with classes="
         )
 
 
-def parse_number(cell: Any, name: str, place: str, error: type[Exception] = DatasetError) -> float:
+def parse_number(cell: Any, name: str, place: str) -> float:
     """Parse a finite number, an int where it is one."""
     try:
         if isinstance(cell, bool) or "_" in str(cell):  # Python reads 1_0 as 10
@@ -567,33 +533,28 @@ def parse_number(cell: Any, name: str, place: str, error: type[Exception] = Data
         value, finite = math.nan, False
     if not finite:
         hint = "; use a decimal point" if re.fullmatch(r"\s*-?\d+,\d+\s*", str(cell)) else ""
-        raise error(f"{place}: {name} must be a finite number, got {describe(cell)}{hint}")
+        raise DatasetError(f"{place}: {name} must be a finite number, got {describe(cell)}{hint}")
     return value
 
 
-def _parse_numbers(
-    name: str, cells: Sequence[Any], places: Sequence[str], error: type[Exception]
-) -> NDArray[Any]:
+def _parse_numbers(name: str, cells: Sequence[Any], places: Sequence[str]) -> NDArray[Any]:
     """Numbers of a column; a missing one, except for a corner or a score, is the usual one of the column."""
     column = _COLUMNS.get("track_id" if name == "track" else name, _Column(math.nan))
     kind = type(column.missing)
     values = []
     for cell, place in zip(cells, places, strict=True):
-        if _is_missing(cell) and name not in (*CORNERS, "score"):
-            values.append(column.missing)
-            continue
-        if kind is bool:
-            flag = _FLAGS.get(str(cell).strip().lower())
-            if flag is None:
-                raise error(f"{place}: {name} must be 0 or 1, got {describe(cell)}")
-            values.append(flag)
-            continue
+        value: Any = column.missing
         if _is_missing(cell) and name == "score":
-            raise error(f"{place}: some boxes have a score and some have none; give all or none")
-        value = parse_number(cell, name, place, error)
-        if kind is int and value != int(value):
-            raise error(f"{place}: {name} must be a whole number, got {describe(cell)}")
-        if not column.low <= value <= column.high or (kind is int and value > _MAX_ID):
-            raise error(f"{place}: {name} must be {column.expected}, got {describe(cell)}")
+            raise DatasetError(f"{place}: some boxes have a score and some have none; give all or none")
+        if kind is bool and not _is_missing(cell):
+            value = _FLAGS.get(str(cell).strip().lower())
+            if value is None:
+                raise DatasetError(f"{place}: {name} must be 0 or 1, got {describe(cell)}")
+        elif not _is_missing(cell) or name in CORNERS:
+            value = parse_number(cell, name, place)
+            if kind is int and value != int(value):
+                raise DatasetError(f"{place}: {name} must be a whole number, got {describe(cell)}")
+            if not column.low <= value <= column.high or (kind is int and value > _MAX_ID):
+                raise DatasetError(f"{place}: {name} must be {column.expected}, got {describe(cell)}")
         values.append(kind(value))
     return np.array(values, {bool: np.bool_, int: np.int64, float: np.float64}[kind])

@@ -254,8 +254,8 @@ def fetch_patches(
     """Download the course's training patches: ``vehicles.zip`` and ``non-vehicles.zip`` (110 MB).
 
     Each archive is verified by the names, number and checksums of its members (8,792 vehicles and 8,968
-    non-vehicles) and written atomically. An existing archive that verifies is not downloaded again. The
-    patches come from the GTI vehicle image database and KITTI (CC BY-NC-SA 3.0, non-commercial).
+    non-vehicles) and written atomically; one that verifies already is not downloaded again. The patches come
+    from the GTI vehicle image database and KITTI (CC BY-NC-SA 3.0, non-commercial).
 
     Returns paths of the vehicles and the non-vehicles, the arguments of `load_training_patches`.
 
@@ -266,13 +266,6 @@ def fetch_patches(
         (``http://`` or ``https://``) that they are at.
     progress
         Show a progress bar on standard error.
-
-    Raises
-    ------
-    DatasetError
-        If a file cannot be downloaded completely or is not the archive.
-    InvalidInputError
-        If `url` is not a web address, or `folder` is not writable.
 
     Examples
     --------

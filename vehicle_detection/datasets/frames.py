@@ -42,19 +42,9 @@ class FrameSet:
 
 
 def load_frames(folder: str | os.PathLike[str]) -> FrameSet:
-    """List the frames (PNG, JPEG) in a folder; `read_labels` reads their boxes.
+    """List the frames (PNG, JPEG) in a folder, without its subfolders; `read_labels` reads their boxes.
 
     ``frames.names[i]`` is the file name that labels refer to; ``frames[i]`` reads the image.
-
-    Parameters
-    ----------
-    folder
-        The folder; its subfolders are not searched.
-
-    Raises
-    ------
-    DatasetError
-        If the folder is missing or holds no frame; on access, if a frame is damaged.
 
     Examples
     --------

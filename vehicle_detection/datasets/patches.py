@@ -166,12 +166,10 @@ def load_patches(
     jobs: int | None = None,
     progress: bool = False,
 ) -> PatchSet:
-    """Read all patches (PNG, JPEG) in a folder or zip file.
+    """Read all patches (PNG, JPEG) in a folder or zip file, with their labels and names.
 
     The order is natural (``image2`` before ``image10``) and the same for a zip and the folder it unpacks to.
-    Hidden files and macOS resource files are skipped.
-
-    Returns patches with their labels and names.
+    Hidden files and macOS resource files are skipped. A damaged patch raises a `DatasetError`.
 
     Parameters
     ----------
@@ -183,13 +181,6 @@ def load_patches(
     size, jobs, progress
         Side in pixels that every patch must have; threads, None for one per core, at most 8; and whether to
         show a progress bar on standard error.
-
-    Raises
-    ------
-    DatasetError
-        If `source` is missing or damaged, or holds no patch, an unreadable one, or one of another size.
-    InvalidInputError
-        If an option is out of range, or `label` is None and no folder name gives the class.
 
     Examples
     --------
@@ -216,19 +207,10 @@ def load_training_patches(
     jobs: int | None = None,
     progress: bool = False,
 ) -> PatchSet:
-    """Read both classes into one set, vehicles first; the arguments are what `fetch_patches` returns.
+    """Read both classes into one set of 64x64 patches, vehicles first, each in natural order.
 
-    Returns patches of 64x64 pixels, in natural order in each class.
-
-    Parameters
-    ----------
-    vehicles, non_vehicles, jobs, progress
-        A folder or zip file for each class; the others as in `load_patches`.
-
-    Raises
-    ------
-    DatasetError
-        As in `load_patches`, for either class.
+    `vehicles` and `non_vehicles` are a folder or zip file each, such as `fetch_patches` returns. Options: see
+    `load_patches`.
 
     Examples
     --------

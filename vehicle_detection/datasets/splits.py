@@ -64,19 +64,8 @@ def split_random(
     """Split at random, with the same fraction of vehicles in both parts.
 
     On frames of a drive this tests on near duplicates of training patches (see `split_leakage`). Report
-    `split_groups`, `split_sequences` or `split_sources` as well.
-
-    Parameters
-    ----------
-    patches_or_labels
-        The set, or its ``(N,)`` labels.
-    test_size, random_state
-        Fraction of test patches, in (0, 1), rounded up to whole patches; and the seed.
-
-    Raises
-    ------
-    InvalidInputError
-        If a class has too few patches for both parts, or an argument is out of range.
+    `split_groups`, `split_sequences` or `split_sources` as well. The patches are a set or its ``(N,)``
+    labels; `test_size` is the fraction of test patches, in (0, 1), rounded up to whole patches.
 
     Examples
     --------
@@ -105,20 +94,8 @@ def split_sequences(patch_set: PatchSet, *, test_size: float = 0.2) -> Split:
 
     If the numbers follow the drive, as in the GTI folders, the frames of one car stay in one part. Those of
     ``KITTI_extracted`` are shuffled: on the course's patches `split_leakage` is 0.21, compared with 0.22 for
-    a random split, 0.02 for `split_sources` and 0 for `split_groups`.
-
-    Parameters
-    ----------
-    patch_set
-        The patches; a folder is identified by its whole path.
-    test_size
-        Fraction of each folder to test on, in (0, 1), rounded. A folder of two or more patches gives at least
-        one to each part; a single patch goes to the training part.
-
-    Raises
-    ------
-    InvalidInputError
-        If `test_size` is out of range, or every folder holds a single patch.
+    a random split, 0.02 for `split_sources` and 0 for `split_groups`. `test_size` is the fraction of each
+    folder to test on, in (0, 1), rounded; a folder of two or more patches gives at least one to each part.
 
     Examples
     --------
@@ -161,11 +138,6 @@ def split_groups(
         As in `find_near_duplicates`, and the seed. On the course's vehicles, most pairs at 0.9 show the same
         car; at 0.85 a quarter of all patches fall into one group by chance.
 
-    Raises
-    ------
-    InvalidInputError
-        If an argument is out of range, or no group fits into the test part.
-
     Examples
     --------
     >>> patches = np.random.default_rng(0).integers(0, 256, (6, 64, 64, 3), np.uint8)
@@ -204,16 +176,9 @@ def split_sources(
 ) -> Split:
     """Train on some sources and test on others, which are from another camera and country.
 
-    The default trains on GTI, and tests on the vehicles of KITTI and the non-vehicles of Extras. The reverse
-    is ``train=("KITTI", "Extras"), test=("GTI",)``.
-
-    Returns the rows of the named sources.
-
-    Parameters
-    ----------
-    patch_set, train, test
-        The patches, and prefixes of the sources of each part: ``"GTI"`` selects ``GTI``, ``GTI_Far`` and so
-        on. Other sources are left out.
+    `train` and `test` are prefixes of the sources of each part: ``"GTI"`` selects ``GTI``, ``GTI_Far`` and
+    so on. Rows of other sources are left out. The reverse of the default is ``train=("KITTI", "Extras"),
+    test=("GTI",)``.
 
     Examples
     --------
@@ -267,16 +232,10 @@ def find_near_duplicates(
     """Find the patches that have a near duplicate in the same set.
 
     Patches are compared by the correlation of their 16x16 gray thumbnails, which ignores brightness and
-    contrast. A uniform patch has no near duplicate. Labels are ignored.
+    contrast; near duplicates reach `threshold`, in (0, 1]. A uniform patch has none. Labels are ignored.
 
     Returns ``(M, 2)`` row numbers: each patch that has a near duplicate, ascending, and the most similar
     patch.
-
-    Parameters
-    ----------
-    patches, threshold
-        A `PatchSet`, or ``(N, 64, 64, 3)`` uint8 RGB; and the smallest correlation of near duplicates, in
-        (0, 1].
 
     Examples
     --------
@@ -338,14 +297,9 @@ def group_near_duplicates(thumbnails: NDArray[np.float32], limit: float) -> NDAr
 
 
 def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95) -> float:
-    """Fraction of test patches that have a near duplicate among the training patches.
+    """Fraction of test patches that have a near duplicate among the training patches, in [0, 1].
 
-    Returns a fraction in [0, 1]; 0 for a split by `split_groups` at this threshold or a lower one.
-
-    Parameters
-    ----------
-    patch_set, split, threshold
-        The patches, a split of them, and the threshold of `find_near_duplicates`.
+    It is 0 for a split by `split_groups` at this threshold (see `find_near_duplicates`) or a lower one.
 
     Examples
     --------

@@ -13,35 +13,22 @@ from vehicle_detection.errors import InvalidInputError
 def calibrate_scores(
     scores: ArrayLike, labels: ArrayLike, *, prior: bool = True, weights: ArrayLike | None = None
 ) -> Platt:
-    """Fit the sigmoid that turns scores into probabilities.
+    """Fit the sigmoid that turns scores into probabilities, and back.
+
+    Platt, "Probabilistic outputs for support vector machines" (1999); with the prior the sigmoid equals that
+    of scikit-learn's ``CalibratedClassifierCV``.
 
     Parameters
     ----------
-    scores
-        ``(N,)`` scores of samples that the model was not trained on.
-    labels
-        ``(N,)`` truth, 0 or 1 or bool, both present.
+    scores, labels
+        ``(N,)`` scores of samples that the model was not trained on; and the truth, 0 or 1 or bool, both
+        present.
     prior
         Smooth the labels with Platt's prior on both classes. False fits plain logistic regression, whose
         slope has no useful limit if the scores separate the classes.
     weights
         ``(N,)`` positive weights of the samples in the fit, for example to give several data sets of
         different sizes the same influence. None: all the same.
-
-    Returns
-    -------
-    Platt
-        The sigmoid, with the methods ``probability(scores)`` and ``score(probability)``.
-
-    Raises
-    ------
-    InvalidInputError
-        If the arrays are empty, differ in length, or hold other values or one class only.
-
-    Notes
-    -----
-    Platt, "Probabilistic outputs for support vector machines" (1999); with the prior the sigmoid equals that
-    of scikit-learn's ``CalibratedClassifierCV``.
 
     Examples
     --------
@@ -108,23 +95,7 @@ def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int 
 
     The sum over `bins` equal bins of ``|mean label - mean probability|``, weighted by the bin's fraction of
     the samples (Naeini et al., "Obtaining well calibrated probabilities using Bayesian binning", 2015).
-
-    Parameters
-    ----------
-    probabilities, labels
-        ``(N,)`` probabilities of a vehicle in [0, 1], and the truth, 0 or 1 or bool.
-    bins
-        Number of bins over [0, 1].
-
-    Returns
-    -------
-    float
-        In [0, 1]; 0 is perfect.
-
-    Raises
-    ------
-    InvalidInputError
-        If the arrays are empty, differ in length, or hold other values.
+    It is in [0, 1]; 0 is perfect. The labels are 0 or 1 or bool.
 
     Examples
     --------

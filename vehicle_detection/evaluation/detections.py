@@ -159,26 +159,14 @@ def evaluate_detections(
     ----------
     predictions, labels
         Detected and true boxes; predictions marked ``ignore`` are left out. Without scores, all scores count
-        as equal.
+        as equal. Names of frames may differ by folder and suffix.
     iou
         Smallest IoU, in (0, 1], at which a detection matches a label or is ignored with an ignored box.
     frames
-        All evaluated frames; None takes those of `predictions` and `labels`. Labels in other frames are left
-        out.
+        All evaluated frames, which must hold those of the predictions; None takes those of both sides.
     ignored_as_regions
         Also ignore a detection of which at least half lies in an ignored box: for labels whose ignored boxes
         cover several vehicles each.
-
-    Returns
-    -------
-    DetectionScores
-        Counts and ratios, overall and by size.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is not `TrackTable`, `iou` is out of range, a prediction is in none of the `frames`, or
-        the names of the same frames are not unique without their folders and suffixes.
 
     Examples
     --------
@@ -219,23 +207,13 @@ def evaluate_detections(
 def precision_recall_curve(
     predictions: TrackTable, labels: TrackTable, *, iou: float = 0.5, ignored_as_regions: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Precision and recall for every threshold on the detections' scores.
-
-    Parameters
-    ----------
-    predictions, labels, iou, ignored_as_regions
-        As in `evaluate_detections`; predictions need scores.
+    """Precision and recall for every threshold on the scores; options as in `evaluate_detections`.
 
     Returns
     -------
     precision, recall, thresholds : numpy.ndarray
         Three ``(K,)`` float64 arrays with one entry for each distinct score, highest first: the values for
         the detections with a score of at least ``thresholds[k]``. Recall is NaN if no vehicle is labelled.
-
-    Raises
-    ------
-    InvalidInputError
-        If predictions have no scores, and where `evaluate_detections` does.
 
     Examples
     --------

@@ -92,24 +92,8 @@ class Explanation:
 def explain(detector: Detector | VehicleDetector, image: NDArray[np.uint8], box: ArrayLike) -> Explanation:
     """Explain why a detector finds a vehicle in a box of an image, or why not.
 
-    Parameters
-    ----------
-    detector
-        A detector with a network or a classifier of patches.
-    image
-        ``(H, W, 3)`` uint8 RGB.
-    box
-        ``[x1, y1, x2, y2]`` in pixels: one that `VehicleDetector.detect` returned, or any other.
-
-    Returns
-    -------
-    Explanation
-        The share of each cell in the score, and what else contributes.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, or the model is a function.
+    `detector` has a network or a classifier of patches, `image` is ``(H, W, 3)`` uint8 RGB, and `box`
+    ``[x1, y1, x2, y2]`` one that `VehicleDetector.detect` returned, or any other.
 
     Notes
     -----

@@ -115,24 +115,7 @@ class LabelledFrames:
     ) -> LabelledFrames:
         """Read every n-th frame of a video, whose labels are keyed by frame number, into memory.
 
-        Parameters
-        ----------
-        path, labels
-            A file that ffmpeg can read, and its true boxes.
-        every
-            Step between the chosen frames; neighboring frames show nearly the same.
-        name, horizon
-            As in the class; None as `name` takes the file name without its suffix.
-
-        Returns
-        -------
-        LabelledFrames
-            Frames by number.
-
-        Raises
-        ------
-        InvalidInputError, VideoError
-            If the file is missing or not a video, or the labels contain none of its frames.
+        `every` is the step between the chosen frames. None as `name` takes the file name without its suffix.
         """
         from vehicle_detection.video import read_frames
 

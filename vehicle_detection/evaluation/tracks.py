@@ -103,25 +103,11 @@ def evaluate_tracks(
 
     A vehicle keeps the track that matched it last as long as their IoU is large enough; the rest are assigned
     for the largest number of matches and, among those, the largest total IoU. The counts equal those of the
-    package motmetrics, and HOTA equals that of TrackEval.
+    package motmetrics, and HOTA equals that of TrackEval. Every box needs a track unless it is marked
+    ``ignore``. Options: see `evaluate_detections`.
 
-    Parameters
-    ----------
-    predictions, labels
-        Tracked and true boxes, each with its track unless it is marked ``ignore``.
-    iou, frames, ignored_as_regions
-        As in `evaluate_detections`; names of frames keep the given order.
-
-    Returns
-    -------
-    TrackScores
-        Counts and ratios. Frames are consecutive if their numbers differ by the smallest difference that
-        occurs, which is 1 unless only every n-th frame is labelled; named frames in their order.
-
-    Raises
-    ------
-    InvalidInputError
-        If a box has no track, and where `evaluate_detections` raises.
+    Frames are consecutive if their numbers differ by the smallest difference that occurs, which is 1 unless
+    only every n-th frame is labelled; named frames in their order.
 
     Notes
     -----

@@ -140,10 +140,9 @@ def without_noise(value: float) -> float:
 
 
 def _image_entry(key: FrameKey, shape: tuple[int, ...] | None) -> dict[str, Any]:
-    """Describe a frame as a COCO image. Its id depends on nothing else, so that files agree about it.
+    """Describe a frame as a COCO image, whose id depends on nothing else, so that files agree about it.
 
-    The id is the frame's number plus 1; for a file name 52 bits of its hash, which every JSON reader holds
-    exactly. A video frame has no file, so that its number serves as the file name.
+    The id is the frame's number plus 1; for a file name 52 bits of its hash, which every JSON reader holds.
     """
     if isinstance(key, str):
         image: dict[str, Any] = {

@@ -441,13 +441,11 @@ def read_labels(
         and of YOLO folders without names, that are vehicles, in upper or lower case. None takes car, van,
         truck, bus and vehicle, and every row of files with numbers.
     shape
-        ``(height, width, ...)`` of the frames, to which boxes are clipped. None does not clip them. YOLO
-        needs it, or `images`.
+        ``(height, width, ...)`` of the frames, to which boxes are clipped. YOLO needs it, or `images`.
     truth
-        The COCO data set whose image and category ids a list of COCO results has; not read otherwise.
+        The COCO data set whose image and category ids a list of COCO results has.
     images
-        The folder of the images of a YOLO folder, which may differ in size, instead of `shape`; not used
-        otherwise.
+        The folder of the images of a YOLO folder, which may differ in size, instead of `shape`.
 
     Returns
     -------
@@ -462,8 +460,6 @@ def read_labels(
     DatasetError
         If the file is missing, has none of these formats, names no class of vehicles, or holds an invalid
         row; the message names the line.
-    InvalidInputError
-        If `path`, `format` or `shape` is none of the values above, or pyarrow is missing.
 
     Notes
     -----
@@ -508,7 +504,7 @@ def _table_of(
     source: Path, found: Found, classes: Collection[str] | None, shape: tuple[int, ...] | None
 ) -> TrackTable:
     """Check the rows of any format, clip their boxes to `shape`, and return them as a table."""
-    columns, places = parse_cells(found.cells, source, found.places, classes=classes)
+    columns, places = parse_cells(found.cells, source, found.places, classes)
     boxes, labelled = columns["boxes"], "score" not in columns
     # A prediction clipped at the border may have no area; a label without area is a mistake.
     sides = boxes[:, 2:] - boxes[:, :2]

@@ -337,17 +337,9 @@ def open_tracks(
 ) -> Iterator[TrackStream]:
     """Open a file for the tracks of a video that is being processed, in constant memory.
 
-    The file appears when the ``with`` block ends without an error; otherwise an existing file is kept.
-
-    Parameters
-    ----------
-    path, format, shape, fps
-        As in `write_tracks`.
-
-    Yields
-    ------
-    TrackStream
-        Function that takes the :class:`FrameResult` of each frame; its ``rows`` counts those written so far.
+    Yields a function that takes the :class:`FrameResult` of each frame; its ``rows`` counts those written so
+    far. The file appears when the ``with`` block ends without an error; otherwise an existing file is kept.
+    Options: see `write_tracks`.
 
     Examples
     --------
@@ -378,7 +370,9 @@ def write_tracks(
     shape: tuple[int, ...] | None = None,
     fps: float | None = None,
 ) -> int:
-    """Write the tracks of a video, or detections, to a file; the file appears only when it is complete.
+    """Write the tracks of a video, or detections, to a file, which appears only when it is complete.
+
+    Returns the number of rows written.
 
     Parameters
     ----------
@@ -396,17 +390,6 @@ def write_tracks(
         Frame rate, with which tables (CSV, JSON Lines, Parquet) get a last column ``time_s``: the frame's
         number divided by it, as in `write_events`.
 
-    Returns
-    -------
-    int
-        Number of rows written.
-
-    Raises
-    ------
-    InvalidInputError
-        If the results are something else or their frames do not ascend, the format is unknown, the frame
-        rate is not a positive number, or the folder is missing or read-only.
-
     Notes
     -----
     ``frame`` counts from 0, the first processed frame; boxes are half-open pixels with two decimals.
@@ -415,12 +398,10 @@ def write_tracks(
     columns up to ``score``, and ``confidence``.
 
     MOT files count frames and pixels from 1, as the MOTChallenge tools do, and hold width and height. A COCO
-    file is a data set whose image ids are the frame numbers plus 1 or depend on the file name alone; for
-    ``COCO.loadRes`` of pycocotools, use `write_labels`.
-
-    The archive for CVAT holds labels to correct, without scores: ``gt/gt.txt`` with frames from 1 and pixels
-    from 0, and ``gt/labels.txt``. A YOLO folder has ``labels/000000.txt`` for each frame, with class, center
-    and size as fractions of the frame, confidence and track.
+    file is a data set; for ``COCO.loadRes`` of pycocotools, use `write_labels`. The archive for CVAT holds
+    labels to correct, without scores: ``gt/gt.txt`` with frames from 1 and pixels from 0, and
+    ``gt/labels.txt``. A YOLO folder has ``labels/000000.txt`` for each frame, with class, center and size as
+    fractions of the frame, confidence and track.
 
     Examples
     --------
@@ -467,40 +448,24 @@ def write_labels(
 ) -> int:
     """Write labelled or predicted boxes to a file without rounding; `read_labels` reads them back.
 
+    Returns the number of boxes written.
+
     Parameters
     ----------
     labels
         The boxes: predictions if they have scores, else labels.
     path, format
-        File to write, and its format:
-
-        - ``"csv"``, ``"jsonl"``, ``"parquet"`` (needs pyarrow): the columns of `TrackTable.to_pandas`.
-        - ``"mot"``: MOTChallenge text, ground truth for labels and results for predictions.
-        - ``"coco"``: a COCO data set with all frames as images, also those without boxes.
-        - ``"coco_results"``: the list of predictions that ``COCO.loadRes`` of pycocotools takes.
-        - ``"mot_zip"``: the archive that CVAT imports as tracks.
-        - ``"kitti"``: a new folder with one ``label_2`` file for each frame.
-        - ``"yolo"``: a new folder with ``data.yaml`` and one file in ``labels`` for each frame.
-
-        None chooses by the suffix: .csv, .jsonl, .ndjson, .parquet, .txt or .zip (MOT), or .json (data set).
+        File to write, and its format: ``"csv"``, ``"jsonl"`` or ``"parquet"`` (the columns of
+        `TrackTable.to_pandas`), ``"mot"`` (MOTChallenge text: ground truth or results), ``"mot_zip"`` (the
+        archive that CVAT imports as tracks), ``"coco"`` (a data set with all frames as images),
+        ``"coco_results"`` (the list of predictions that ``COCO.loadRes`` of pycocotools takes), ``"kitti"``
+        (a new folder with one ``label_2`` file for each frame) or ``"yolo"`` (a new folder with ``data.yaml``
+        and ``labels``). None chooses by the suffix as in `write_tracks`.
     shape
-        ``(height, width, ...)`` of the images, which YOLO and some viewers of COCO data sets need. All images
-        have this shape: write those of each size separately.
+        ``(height, width, ...)`` of all images, which YOLO and some viewers of COCO data sets need.
     truth
         A COCO data set whose image ids are used; required for results. Frames are found by file name, or by
         number in data sets written here. A data set has its images, too.
-
-    Returns
-    -------
-    int
-        Number of boxes written.
-
-    Raises
-    ------
-    InvalidInputError
-        If the format is unknown or cannot hold these boxes, or the folder is missing or read-only.
-    DatasetError
-        If `truth` is missing or not a COCO data set.
 
     Notes
     -----
@@ -519,8 +484,8 @@ def write_labels(
     - KITTI: numbered frames (an error), suffixes of images' names, tracks, distance and speed. Ignored
       boxes become regions, and `read_labels` ignores labels that are narrow, hidden or truncated.
 
-    Without `truth`, the id of a COCO image is its frame number plus 1 or a hash of its file name: it does not
-    depend on the other frames, so that labels and predictions written separately agree.
+    Without `truth`, the id of a COCO image is its frame number plus 1 or a hash of its file name, so that
+    labels and predictions written separately agree.
 
     Examples
     --------

@@ -98,9 +98,7 @@ def train_classifier(
 
     The SVM is that of ``LinearSVC(C, dual=True)``, with scores within 1e-4, by a solver that needs no copy of
     the features: on 17,760 patches with 8,460 features a fifth of the time (5 of 24 s) and 4 GB less memory.
-
-    Returns a model with one template. Its metadata also hold the training options and the versions of
-    libraries. The same input and seed give the same model.
+    The model has one template; the same input and seed give the same model.
 
     Parameters
     ----------
@@ -114,10 +112,8 @@ def train_classifier(
     estimator
         An unfitted scikit-learn classifier with linear scores, such as ``LogisticRegression(C=0.01)``, that
         replaces the SVM and its `C`.
-    jobs
-        Threads of the feature extraction.
-    metadata
-        JSON values to keep in the model file.
+    jobs, metadata
+        Threads of the feature extraction; and JSON values to keep in the model file, besides the options.
 
     Examples
     --------

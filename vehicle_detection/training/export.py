@@ -32,28 +32,12 @@ def export_network(
     *,
     quantize: bool = True,
 ) -> bytes:
-    """Return the model file of a network.
+    """Return the model file of a network; some of the frames set the 8-bit ranges of its activations.
 
     The graph takes uint8 RGB images ``(1, H, W, 3)``, sides multiples of 32, and returns ``(1, 5, cells)``:
-    center, width, height and probability of a box for each cell, as YOLOv8 does for one class.
-
-    Parameters
-    ----------
-    network
-        What `train_network` returns.
-    frames
-        Frames whose activations set the 8-bit ranges; some of them are taken, evenly spaced.
-    params, metadata
-        Numbers that the detector needs (calibration, threshold, input size), and facts for people, as values
-        of JSON.
-    quantize
-        False keeps weights and activations as float32.
-
-    Returns
-    -------
-    bytes
-        The file. Weights have 7 bits, so that sums of products fit into 16 bits on processors without VNNI;
-        the output convolution stays float32.
+    center, width, height and probability of a box for each cell, as YOLOv8 does for one class. Weights have
+    7 bits, so that sums of products fit into 16 bits on processors without VNNI; the output convolution stays
+    float32, and without `quantize` everything does.
     """
     import onnx
 

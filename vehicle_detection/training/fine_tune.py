@@ -54,23 +54,12 @@ _PACKAGES = "torch", "onnx", "onnxruntime"
 
 @dataclass(frozen=True, eq=False)
 class FineTuning:
-    """A fine-tuned network, and its scores on the held-out frames.
-
-    Attributes
-    ----------
-    model
-        The network; ``model.save(path)`` writes its file.
-    before, after
-        Scores of the initial network and of the new one, each at its own threshold, for each set of held-out
-        frames; empty if there was no frame to hold out.
-    folds
-        Detections of the new network in these frames.
-    """
+    """A fine-tuned network, and its scores on the held-out frames, if there are any."""
 
     model: NetworkModel
-    before: list[FoldScore]
-    after: list[FoldScore]
-    folds: list[FoldDetections]
+    before: list[FoldScore]  # of the initial network at its own threshold, for each set of held-out frames
+    after: list[FoldScore]  # of the new one
+    folds: list[FoldDetections]  # of the new one
 
 
 def fine_tune_network(
@@ -98,10 +87,8 @@ def fine_tune_network(
         ``"default"`` or a file of this function or of the command ``train-frames``.
     steps
         Steps of 8 samples; None takes 5 for each frame, 200 to 1200. A step takes 0.6 s on two cores.
-    random_state
-        Seed of the samples.
-    jobs
-        Threads, and processes that draw samples on CUDA.
+    random_state, jobs
+        Seed of the samples; threads, and processes that draw samples on CUDA.
     device
         ``"cpu"`` or ``"cuda"``; None takes CUDA where PyTorch offers it. The same seed on the same kind of
         device, with the same number of threads, gives the same network.
@@ -110,19 +97,6 @@ def fine_tune_network(
         removed at the end.
     on_step
         Called with the number of finished steps and a line with the time left, every 10 s.
-
-    Returns
-    -------
-    FineTuning
-        The network, and its scores before and after.
-
-    Raises
-    ------
-    InvalidInputError
-        If the frames show no vehicle, a box lies outside its image, the checkpoint is of another training, or
-        an argument is malformed.
-    ModelFileError
-        If `initial` is not a network of this library.
     """
     checked = check_sources(sources)
     seed = check_integer(random_state, "random_state", low=0)
@@ -181,11 +155,6 @@ def hold_out(sources: Sequence[FrameDataset]) -> tuple[list[FrameDataset], list[
 
     Neighboring frames, which may show the same vehicles, stay together: two of ten blocks are held out. At
     least one frame is, unless no vehicle would be left to train on.
-
-    Raises
-    ------
-    InvalidInputError
-        If no frame has a vehicle.
     """
     parts = [(source, part) for source in sources for part in source.sets]
     if not any((~part.labels["ignore"]).any() for _, part in parts):

@@ -29,17 +29,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class FrameDataset:
-    """Labelled frames of one camera or country.
-
-    Attributes
-    ----------
-    name, sets
-        Name of the data set, and its sets of labelled frames.
-
-    Raises
-    ------
-    InvalidInputError
-        If the name is empty, or there are no frames.
+    """Labelled frames of one camera or country: a name, and one or more sets.
 
     Examples
     --------
@@ -191,22 +181,7 @@ def load_training_frames(
 ) -> list[TrainingFrame]:
     """Load all frames of some data sets into memory.
 
-    A frame whose longer side exceeds `max_side` pixels is reduced to it, and its boxes with it; None keeps
-    all frames as they are.
-
-    Raises
-    ------
-    InvalidInputError
-        If a box lies outside its image, or an argument is malformed.
-
-    Examples
-    --------
-    >>> from vehicle_detection.tables import TrackTable
-    >>> labels = TrackTable([0], None, [[8, 8, 60, 50]])
-    >>> road = LabelledFrames("road", [np.zeros((90, 120, 3), np.uint8)], labels)
-    >>> (frame,) = load_training_frames([FrameDataset("camera", [road])], max_side=60)
-    >>> frame.image.shape, frame.boxes.tolist()
-    ((45, 60, 3), [[4.0, 4.0, 30.0, 25.0]])
+    A frame whose longer side exceeds `max_side` pixels is reduced to it, and its boxes with it.
     """
     if max_side is not None:
         max_side = check_integer(max_side, "max_side", low=16)

@@ -29,22 +29,10 @@ class Targets(NamedTuple):
 def detection_loss(
     logits: Tensor, predicted: Tensor, centers: Tensor, targets: Targets
 ) -> tuple[Tensor, Tensor]:
-    """Return the losses of the scores and of the boxes.
+    """Return the losses of the scores and of the boxes of the logits and boxes that `Network` returns.
 
-    Parameters
-    ----------
-    logits, predicted
-        What `Network` returns: ``(n, cells)`` and ``(n, cells, 4)``.
-    centers
-        ``(cells, 2)`` centers of the cells.
-    targets
-        The boxes of each image.
-
-    Returns
-    -------
-    score_loss, box_loss : torch.Tensor
-        Binary cross-entropy with the alignment as target; and 2.5 times ``1 - CIoU`` of the cells that answer
-        for a vehicle. Both are means over the alignments of the batch.
+    They are the binary cross-entropy with the alignment as target; and 2.5 times ``1 - CIoU`` of the cells
+    that answer for a vehicle: means over the alignments of the batch. `centers` are ``(cells, 2)``.
     """
     with torch.no_grad():
         target, vehicle = _assign(logits, predicted, centers, targets.boxes, targets.usable)

@@ -48,8 +48,7 @@ def mine_negatives(
     Parameters
     ----------
     frames, labels
-        Images by key, a list of images with their numbers as keys, or the frames of `load_frames`; and their
-        true boxes. A frame without a box counts as empty.
+        As in `LabelledFrames`.
     classifier, jobs
         The model whose false positives are collected, and the threads of its search.
     search_params, min_score

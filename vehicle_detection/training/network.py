@@ -35,35 +35,17 @@ _CHECKPOINT_SECONDS, _REPORT_SECONDS = 30.0, 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkTraining:
-    """Length and course of a training.
-
-    Attributes
-    ----------
-    steps, batch
-        Number of steps, and samples of a step.
-    size
-        Width and height of the samples in pixels, multiples of 32.
-    rate
-        Highest learning rate of AdamW, reached after `warm_up` steps; it falls as a cosine.
-    random_state
-        Seed of the samples and of the first weights.
-    warm_up
-        Steps over which the rate rises.
-    frozen_statistics
-        Whether batch normalization keeps its means and variances: for batches of a few samples, and for
-        networks of `read_weights`.
-    data
-        Fingerprint of frames and initial weights; a checkpoint with another one is not continued.
-    """
+    """Length and course of a training."""
 
     steps: int
-    batch: int = 64
-    size: tuple[int, int] = (640, 384)
-    rate: float = 2.5e-3
-    random_state: int = 0
-    warm_up: int = 300
+    batch: int = 64  # samples of a step
+    size: tuple[int, int] = (640, 384)  # width and height of the samples (px), multiples of 32
+    rate: float = 2.5e-3  # highest learning rate of AdamW, after `warm_up` steps; it falls as a cosine
+    random_state: int = 0  # seed of the samples and of the first weights
+    warm_up: int = 300  # steps over which the rate rises
+    # Keep means and variances of batch normalization: for small batches and networks of `read_weights`.
     frozen_statistics: bool = False
-    data: str = ""
+    data: str = ""  # fingerprint of frames and initial weights; a checkpoint with another is not continued
 
 
 def train_network(
@@ -76,34 +58,11 @@ def train_network(
     checkpoint: Path | None = None,
     on_step: Callable[[int, str], object] | None = None,
 ) -> Network:
-    """Train a network.
+    """Train a network on frames in memory, from `initial` or from random weights.
 
-    Parameters
-    ----------
-    frames
-        Labelled frames, in memory.
-    training
-        Length and course.
-    initial
-        Network to continue from; None starts with random weights.
-    device
-        ``"cuda"`` or ``"cpu"``; None takes CUDA where PyTorch offers it.
-    jobs
-        Processes that draw samples, and threads of a training on the processor.
-    checkpoint
-        File that the state of the training is written to, and from which an interrupted training continues.
-    on_step
-        Called with the number of finished steps and a line of text, now and then.
-
-    Returns
-    -------
-    Network
-        The moving average of the weights, on the processor, for evaluation.
-
-    Raises
-    ------
-    InvalidInputError
-        If no frame has a vehicle.
+    `jobs` processes draw samples, and as many threads compute on the processor. An interrupted training
+    continues from its `checkpoint`. `on_step` is called with the number of finished steps and a line of text,
+    now and then. Returns the moving average of the weights, on the processor, for evaluation.
     """
     if not any(len(frame.boxes) for frame in frames):
         raise InvalidInputError("frames must show at least one vehicle; label some, and pass their labels")

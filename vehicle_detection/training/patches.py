@@ -67,38 +67,22 @@ class SplitScore:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingReport:
-    """Options and results of `train_and_evaluate`.
+    """Options and results of `train_and_evaluate`; `split` is the split whose accuracy is reported.
 
-    Attributes
-    ----------
-    params, options
-        The features, and the other options.
-    split
-        Split whose accuracy is reported as the model's.
-    sources
-        Number of patches of each source folder.
-    vehicles, non_vehicles
-        Number of patches of each class.
-    fingerprint
-        Fingerprint of the patches, see `PatchSet`.
-    splits, skipped
-        Scores on each split that the patches allow; and the other splits, with the reason.
-    calibration_error
-        On the split ``"sequences"``; None if it cannot be made twice.
-    seconds
-        Time of each step; times of concurrent fits add up.
+    `seconds` are the times of each step, of which concurrent fits add up; `calibration_error` is that on the
+    split ``"sequences"``, None if it cannot be made twice.
     """
 
     params: FeatureParams
     options: TrainingOptions
     split: str
-    sources: dict[str, int]
+    sources: dict[str, int]  # number of patches of each source folder
     vehicles: int
     non_vehicles: int
-    fingerprint: str
+    fingerprint: str  # of the patches, see `PatchSet`
     splits: dict[str, SplitScore]
     calibration_error: float | None
-    skipped: dict[str, str]
+    skipped: dict[str, str]  # splits that the patches do not allow, with the reason
     seconds: dict[str, float]
 
     @property
@@ -139,7 +123,8 @@ def train_and_evaluate(
     """Evaluate a classifier on several splits, then train it on all patches.
 
     On each split, scaler and SVM are fitted on the training part and its copies, and evaluated on the
-    unchanged test part.
+    unchanged test part. Returns the classifier, whose metadata also hold the metrics and the patches' counts
+    and fingerprint, and a report with all results and the time of each step.
 
     Parameters
     ----------
@@ -149,19 +134,10 @@ def train_and_evaluate(
         As in `train_classifier`; the seed is also that of the first random split.
     split
         Split whose accuracy is reported as the model's. Others are skipped if the patches do not allow them.
-    seeds
-        Number of random splits.
-    jobs
-        Threads; the result does not depend on them.
+    seeds, jobs
+        Number of random splits; and threads, on which the result does not depend.
     progress
         Show a progress bar if standard error is a terminal.
-
-    Returns
-    -------
-    classifier : VehicleClassifier
-        Trained on all patches. Its metadata also holds the metrics and the patches' counts and fingerprint.
-    report : TrainingReport
-        All results, and the time of each step.
 
     Examples
     --------

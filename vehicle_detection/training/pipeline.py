@@ -23,8 +23,7 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
     The parameters are the fields of `FeatureParams`, checked by `fit`, and `jobs` of `extract_features`.
     The transformer has no state and works without `fit`. It ignores the gains, which only `train_classifier`
-    uses. It passes scikit-learn's estimator checks that do not need tables of numbers as input; images have
-    four dimensions, and ``n_features_in_`` is not set.
+    uses. It passes scikit-learn's estimator checks that do not need tables of numbers as input.
 
     Examples
     --------

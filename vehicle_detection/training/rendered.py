@@ -63,29 +63,9 @@ def rendered_source(*, frames: int = 300, random_state: int = 0) -> FrameDataset
 
     Frames of drives and single scenes take turns. The scenes add what the traffic of the drives lacks:
     trucks, many vans, vehicles seen from the front, vehicles at the shoulder, and vehicles close beside the
-    camera, of which the frame shows the side and cuts a part. The random numbers of every drive and scene
-    follow from `random_state`. A vehicle is ignored if it is largely occluded, truncated by more than 0.7, or
-    narrower than 1/32 of the frame's longer side.
+    camera, of which the frame shows the side and cuts a part. A vehicle is ignored if it is largely occluded,
+    truncated by more than 0.7, or narrower than 1/32 of the frame's longer side.
 
-    Parameters
-    ----------
-    frames
-        Number of frames.
-    random_state
-        Seed.
-
-    Returns
-    -------
-    FrameDataset
-        The data set ``"rendered"`` of one set of frames, in memory, 640 or 1280 pixels wide.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is out of range.
-
-    Examples
-    --------
     >>> rendered_source(frames=2).sets
     (LabelledFrames('rendered', 2 frames, 14 boxes),)
     """

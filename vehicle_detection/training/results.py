@@ -73,13 +73,8 @@ def numeric_column(table: DataFrame, name: str) -> NDArray[np.float64]:
 def pareto_front(table: DataFrame, quality: str = "accuracy", cost: str = "search_ms") -> DataFrame:
     """Select the rows that no other row beats in quality or cost without being worse in the other.
 
-    Returns the selected rows, cheapest first, with their index.
-
-    Parameters
-    ----------
-    table, quality, cost
-        Results, such as those of `compare_configurations`, and numeric columns: a higher quality and a lower
-        cost are better. Rows without either value are left out. Of equal rows the first one is kept.
+    Returns the selected rows, cheapest first, with their index. The columns are numeric: a higher `quality`
+    and a lower `cost` are better. Rows without either are left out; of equal rows the first one is kept.
 
     Examples
     --------
@@ -118,20 +113,9 @@ def write_results(table: DataFrame, path: str | os.PathLike[str]) -> None:
 def read_results(path: str | os.PathLike[str]) -> DataFrame:
     """Read the table of a finished or interrupted run: the ``store`` of a search, or a written table.
 
-    Returns one row per line; see `compare_configurations` for the columns. NaN marks a missing value.
-
-    Parameters
-    ----------
-    path
-        A ``.csv`` or ``.jsonl`` file. An incomplete last line is left out, and so is the second row of a
-        trial that two runs have measured at the same time.
-
-    Raises
-    ------
-    DatasetError
-        If the file is missing, or a line in it is damaged.
-    InvalidInputError
-        If the file name has another suffix.
+    Returns one row per line of the ``.csv`` or ``.jsonl`` file; see `compare_configurations` for the columns.
+    NaN marks a missing value. An incomplete last line is left out, and so is the second row of a trial that
+    two runs have measured at the same time; another damaged line raises a `DatasetError`.
 
     Examples
     --------

@@ -46,17 +46,7 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sampler:
-    """Draws samples from frames.
-
-    Attributes
-    ----------
-    frames
-        Frames to draw from.
-    size
-        Width and height of the samples.
-    weights
-        Probability of each frame.
-    """
+    """Draws samples of a width and height from frames, each of which has a probability."""
 
     frames: Sequence[TrainingFrame]
     size: tuple[int, int]

@@ -99,13 +99,6 @@ def compare_configurations(
         A ``.csv`` or ``.jsonl`` file to which each row is appended as soon as it is measured. Rows that it
         already holds are not measured again; an incomplete last line is dropped.
 
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed or names an unknown option.
-    DatasetError
-        If the store is damaged or from another release.
-
     Examples
     --------
     >>> from vehicle_detection import render_patches
@@ -153,24 +146,12 @@ def compare_configurations(
 
 @dataclass(frozen=True, kw_only=True)
 class Halving(Checked):
-    """Numbers of a search by successive halving.
+    """Numbers of a search by successive halving, in which one of `factor` candidates survives a round."""
 
-    Attributes
-    ----------
-    n_folds
-        Number of folds of the cross-validation.
-    n_candidates
-        Number of combinations to draw at random (``HalvingRandomSearchCV``); None tries all.
-    factor
-        One of `factor` candidates survives a round, and the number of patches grows by `factor`.
-    n_finalists
-        Number of best candidates to measure in full.
-    """
-
-    n_folds: int = integer(3, low=2, high=100)
-    n_candidates: int | None = integer(None, low=1)
-    factor: int = integer(3, low=2, high=100)
-    n_finalists: int = integer(3, low=0)
+    n_folds: int = integer(3, low=2, high=100)  # of the cross-validation
+    n_candidates: int | None = integer(None, low=1)  # combinations to draw at random; None tries all
+    factor: int = integer(3, low=2, high=100)  # the number of patches grows by it
+    n_finalists: int = integer(3, low=0)  # best candidates to measure in full
 
 
 def search_parameters(
@@ -192,6 +173,10 @@ def search_parameters(
     finalists are then trained on the training part of the split and evaluated on its test part, on the
     frames, and by the time of their search.
 
+    Returns the columns of `compare_configurations`. The stages are ``"grid"`` (impossible combinations),
+    ``"halving"`` (one row per candidate, fold and number of patches) and ``"final"`` (the finalists, best
+    first in the last round). Choose from ``pareto_front(table[table["stage"] == "final"])``.
+
     Parameters
     ----------
     patch_set, grid
@@ -205,20 +190,6 @@ def search_parameters(
         interrupted one continues from its store.
     options, store, progress
         As in `compare_configurations`.
-
-    Returns
-    -------
-    pandas.DataFrame
-        The columns of `compare_configurations`. The stages are ``"grid"`` (impossible combinations),
-        ``"halving"`` (one row per candidate, fold and number of patches) and ``"final"`` (the finalists,
-        best first in the last round). Choose from ``pareto_front(table[table["stage"] == "final"])``.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, or no combination of the grid is possible.
-    DatasetError
-        If the store is damaged or from another release.
 
     Examples
     --------
@@ -407,26 +378,21 @@ def compare_classifiers(
 
     The features are scaled by a ``StandardScaler`` that is fitted on the training part, as in the course.
 
+    Returns one row for each classifier and split, with the columns ``classifier``, ``split``, ``seed``,
+    ``train_size`` and ``test_size`` (patches), ``accuracy``, ``false_negative_rate``,
+    ``false_positive_rate``, ``fit_seconds`` and ``predict_seconds`` (of all test patches).
+
     Parameters
     ----------
-    patch_set
-        The patches.
+    patch_set, params
+        The patches and the features, by default ``FeatureParams()``.
     classifiers
         Estimators of scikit-learn by name; they are copied, not changed. None compares Gaussian naive Bayes
         with a linear SVM.
-    params
-        The features; the default is ``FeatureParams()``.
     splits, seeds, progress
         As in `compare_configurations`.
     cache, jobs
         As in `TrialOptions`.
-
-    Returns
-    -------
-    pandas.DataFrame
-        One row for each classifier and split, with the columns ``classifier``, ``split``, ``seed``,
-        ``train_size`` and ``test_size`` (patches), ``accuracy``, ``false_negative_rate``,
-        ``false_positive_rate``, ``fit_seconds`` and ``predict_seconds`` (of all test patches).
 
     Examples
     --------

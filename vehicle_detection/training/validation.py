@@ -167,21 +167,8 @@ def detect_in_source(
 ) -> list[FoldDetections]:
     """Detect vehicles in all frames of a source, one `FoldDetections` for each of its sets.
 
-    Parameters
-    ----------
-    model
-        Any model; its scores are log-odds above its own threshold.
-    source
-        Labelled frames.
-    min_score
-        Minimum score of a detection: low, so that a precision-recall curve covers all thresholds in use.
-    jobs
-        Frames searched at the same time; the result does not depend on it.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed.
+    Scores are log-odds above the model's own threshold; a low `min_score` covers all thresholds in use. The
+    result does not depend on `jobs`, the number of frames searched at the same time.
     """
     lowest = check_number(min_score, "min_score")
     with model.open_search(jobs=1) as search, ThreadPoolExecutor(resolve_jobs(jobs)) as pool:

@@ -15,28 +15,11 @@ from vehicle_detection.training.architecture import STRIDES, Network
 
 
 def read_weights(graph: bytes, name: str) -> Network:
-    """Return the network of a model file that `export_network` has written.
+    """Return the network of a model file that `export_network` has written, in evaluation mode.
 
     Batch normalization is a part of the convolutions in the file. In the returned network, it only adds the
-    bias of its convolution: with a running mean of 0 and a variance of 1, and a weight of 1.
-
-    Parameters
-    ----------
-    graph
-        Content of the file; 8-bit weights are read as the numbers that they stand for.
-    name
-        How messages refer to the file.
-
-    Returns
-    -------
-    Network
-        A network in evaluation mode, whose outputs are those of the file up to the 8-bit rounding of its
-        activations.
-
-    Raises
-    ------
-    ModelFileError
-        If the file is damaged, or holds another network.
+    bias of its convolution: with a running mean of 0 and a variance of 1, and a weight of 1. The outputs are
+    those of the file up to the 8-bit rounding of its activations.
     """
     import onnx
     from google.protobuf.message import DecodeError
