@@ -51,11 +51,6 @@ def annotate_clip(
         again. Going back in time, as a second rendering does, forgets all frames and starts anew; its result
         equals that of the first. Skipping more than ``track_params.max_gap`` seconds ends all tracks.
 
-    Raises
-    ------
-    InvalidInputError
-        If `clip` is not a video clip of moviepy 2.
-
     Examples
     --------
     >>> from moviepy import VideoFileClip  # doctest: +SKIP

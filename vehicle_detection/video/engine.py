@@ -18,7 +18,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,7 @@ from vehicle_detection.tracking import (
     search_delay,
     search_interval,
 )
+from vehicle_detection.video.queues import ClosableQueue, QueueClosed
 from vehicle_detection.video.reading import AudioSource, Reader, check_span, frame_range
 from vehicle_detection.video.sources import FrameSource, Source, borrow_source
 
@@ -53,7 +54,6 @@ _LOG_INTERVAL = 60.0
 # Maximum size of the frames that are decoded ahead of the search, unless each worker has only one.
 _LOOKAHEAD_BYTES = 256 << 20
 
-Item = TypeVar("Item")
 Frame = NDArray[np.uint8]
 
 
@@ -80,20 +80,16 @@ class VideoReport:
 
     Attributes
     ----------
-    frames
-        Number of frames.
-    fps
-        Exact frame rate of the video.
-    shape
-        Shape of a frame: ``(height, width, 3)``.
+    frames, tracks
+        Numbers of frames, and of different tracks shown.
+    fps, shape
+        Exact frame rate of the video, and shape of a frame: ``(height, width, 3)``.
     seconds
         Elapsed time of the run.
     stages
         Seconds of work per stage, without waiting: ``"decode"``, ``"search"``, the detector's other stages,
         ``"draw"`` and ``"encode"``. Decode and encode are processor time over all cores, the others elapsed
         time. Stages run in parallel, so their sum may exceed `seconds`.
-    tracks
-        Number of different tracks shown.
     dropped
         Number of frames of a live source that were dropped because the search was busy.
     damage
@@ -134,76 +130,16 @@ class VideoReport:
         return {name: seconds / total if total else 0.0 for name, seconds in self.stages.items()}
 
     def __str__(self) -> str:
-        height, width = self.shape[:2]
-        rate = self.frames_per_second
+        (height, width, _), rate, fractions = self.shape, self.frames_per_second, self.stage_fractions
+        dropped = f", {pluralize(self.dropped, 'frame')} dropped" if self.dropped else ""
         lines = [
-            f"{pluralize(self.frames, 'frame')} of {width}x{height} in {self.seconds:.1f} s: "
-            f"{rate:.1f} frames/s, {rate / self.fps:.1f} times real time, {pluralize(self.tracks, 'vehicle')}"
-            + (f", {pluralize(self.dropped, 'frame')} dropped" if self.dropped else ""),
+            f"{pluralize(self.frames, 'frame')} of {width}x{height} in {self.seconds:.1f} s: {rate:.1f} "
+            f"frames/s, {rate / self.fps:.1f} times real time, {pluralize(self.tracks, 'vehicle')}{dropped}",
             "stage    ms/frame  fraction",
         ]
-        fractions = self.stage_fractions
         for name, seconds in self.stages.items():
             lines.append(f"{name:<8} {seconds / max(self.frames, 1) * 1e3:>8.2f} {fractions[name]:>9.1%}")
         return "\n".join(lines)
-
-
-class QueueClosed(Exception):  # noqa: N818 - a signal between threads, not an error
-    """The other side has closed the queue."""
-
-
-class ClosableQueue(Generic[Item]):
-    """A bounded queue between two threads that either side can close.
-
-    With ``queue.Queue`` a producer would wait forever for a consumer that has failed.
-    """
-
-    def __init__(self, size: int) -> None:
-        self._items: deque[Item] = deque()
-        self._size = size
-        # Used instead of the condition's own __enter__, whose interrupt could leave the lock acquired.
-        self._lock = threading.RLock()
-        self._changed = threading.Condition(self._lock)
-        self._finished = self._aborted = False
-        self._error: BaseException | None = None
-
-    def put(self, item: Item) -> None:
-        """Append an item when there is space; raise the error of `abort`, or `QueueClosed`."""
-        with self._lock:
-            while len(self._items) >= self._size and not self._aborted:
-                self._changed.wait()
-            if self._aborted:
-                raise self._error or QueueClosed
-            self._items.append(item)
-            self._changed.notify_all()
-
-    def finish(self, error: BaseException | None = None) -> None:
-        """Close the queue after the last item; the consumer gets the remaining items, then the error."""
-        with self._lock:
-            self._finished = True
-            self._error = self._error or error
-            self._changed.notify_all()
-
-    def abort(self, error: BaseException | None = None) -> None:
-        """Close the queue for both sides at once; waiting items are dropped."""
-        with self._lock:
-            self._aborted = True
-            self._error = self._error or error
-            self._items.clear()
-            self._changed.notify_all()
-
-    def __iter__(self) -> Iterator[Item]:
-        while True:
-            with self._lock:
-                while not self._items and not self._finished and not self._aborted:
-                    self._changed.wait()
-                if not self._items:
-                    if self._aborted or self._error is not None:
-                        raise self._error or QueueClosed
-                    return
-                item = self._items.popleft()
-                self._changed.notify_all()
-            yield item
 
 
 @dataclass
@@ -315,10 +251,9 @@ class _Pipeline:
             cut = cuts.update(frame)
             skipped += 1
             missed = index - expected if expected is not None else 0
+            search = None
             if expected is None or missed or cut or skipped >= self._interval:
                 search, skipped = self._pool.submit(self._search, frame), 0
-            else:
-                search = None
             kept = frame if self._keeps_frames else None
             self._queue.put(_QueuedFrame(moment, kept, cut, search, missed))
             del frame, kept
@@ -432,7 +367,9 @@ class TrackRun(Closing):
         now = time.perf_counter()
         if self._progress and now - self._logged >= _LOG_INTERVAL:
             self._logged = now
-            self._log_progress(now - self._started)
+            length = f" of {self._position(self._total)}" if self._total else ""
+            rate = self._frames / (now - self._started)
+            _LOGGER.info("%s%s, %.0f frames/s", self._position(self._frames), length, rate)
         return result  # type: ignore[no-any-return]
 
     def _start(self) -> None:
@@ -443,11 +380,6 @@ class TrackRun(Closing):
         self._on_end.callback(self._results.close)
         self.detector.reset(fps=float(self.info.fps))
         self._started = self._logged = time.perf_counter()
-
-    def _log_progress(self, seconds: float) -> None:
-        length = f" of {self._position(self._total)}" if self._total else ""
-        rate = self._frames / seconds
-        _LOGGER.info("%s%s, %.0f frames/s", self._position(self._frames), length, rate)
 
     def _position(self, frames: int) -> str:
         """Return the length of a number of frames in minutes and seconds."""
@@ -527,14 +459,7 @@ def track(
     -------
     TrackRun
         An iterator of `FrameResult`. Closing it, deleting it or leaving its ``with`` block ends all processes
-        and threads.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is invalid.
-    VideoError
-        If the source cannot be decoded; while reading, if a server sends only a part of it.
+        and threads. It raises a `VideoError` where the source cannot be decoded.
 
     Examples
     --------

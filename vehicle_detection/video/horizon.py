@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Protocol
 
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tracking import HorizonEstimate, estimate_horizon
-from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.reading import check_span, frame_range
 from vehicle_detection.video.sources import Source, borrow_source
 
@@ -43,22 +43,16 @@ def estimate_video_horizon(
             raise InvalidInputError(
                 f"horizon cannot be estimated from {opened.name}, which is read only once; pass a fraction"
             )
-        shape, step = opened.info.shape, _step(opened.info, start, end)
-        with opened.read(*frame_range(opened.info, start, end)) as frames:
-            for count, (_, _, frame) in enumerate(frames):
-                if count >= step * _MAX_FRAMES or sum(map(len, boxes)) >= _ENOUGH_BOXES:
+        info, fps = opened.info, float(opened.info.fps)
+        seconds = min(info.frames / fps, math.inf if end is None else end) - (start or 0.0)
+        step = max(1, round(fps * min(_INTERVAL, seconds / _MIN_FRAMES)))
+        with opened.read(*frame_range(info, start, end)) as frames:
+            for _, _, frame in itertools.islice(frames, 0, step * _MAX_FRAMES, step):
+                boxes.append(detector.detect(frame).boxes)
+                if sum(map(len, boxes)) >= _ENOUGH_BOXES:
                     break
-                if count % step == 0:
-                    boxes.append(detector.detect(frame).boxes)
     try:
-        found = estimate_horizon(np.concatenate(boxes), shape)
+        found = estimate_horizon(np.concatenate(boxes), info.shape)
     except InvalidInputError:  # too few boxes
         return None
     return found if found.horizon_std <= _MAX_STD and 0 <= found.horizon <= 1 else None
-
-
-def _step(info: VideoInfo, start: float | None, end: float | None) -> int:
-    """Frames from one searched frame to the next."""
-    fps = float(info.fps)
-    seconds = min(info.frames / fps, math.inf if end is None else end) - (start or 0.0)
-    return max(1, round(fps * min(_INTERVAL, seconds / _MIN_FRAMES)))

@@ -10,7 +10,7 @@ import select
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 
 import numpy as np
@@ -28,6 +28,7 @@ from vehicle_detection.video.ffmpeg import (
     video_error,
 )
 from vehicle_detection.video.probe import VideoInfo
+from vehicle_detection.video.queues import ClosableQueue, QueueClosed
 from vehicle_detection.video.reading import Reader
 from vehicle_detection.video.yuv import ColorEncoding, rgb_from_planes
 
@@ -77,24 +78,20 @@ class _LiveProcess:
                 raise TransientVideoError(
                     f"{self.name} sends no video within {_OPEN_TIMEOUT:g} s; check the source"
                 )
-            code = self.process.wait()
-            check_resources(self.name, code, self.process.log())
-            check_frame_size(self.name, self.process.log())
-            remedy = "check the source"
-            if "received no packets" in self.reason() and self.name == "-":
+            code, log = self.process.wait(), self.process.log()
+            check_resources(self.name, code, log)
+            check_frame_size(self.name, log)
+            reason, remedy = last_line(log), "check the source"
+            if "received no packets" in reason and self.name == "-":
                 remedy = (
                     "pass the file's path, because MP4 needs its index at the start to come through a pipe"
                 )
-            message = f"{self.name} is not a video that ffmpeg can read ({self.reason()}); {remedy}"
-            raise video_error(message, self.name, code, self.process.log())
+            message = f"{self.name} is not a video that ffmpeg can read ({reason}); {remedy}"
+            raise video_error(message, self.name, code, log)
         width, height, numerator, denominator = (int(number) for number in size.groups())
         return VideoInfo(
             width=width, height=height, fps=Fraction(numerator, denominator or 1), frames=0, duration=0.0
         )
-
-    def reason(self) -> str:
-        """Last message of ffmpeg."""
-        return last_line(self.process.log())
 
     def read_planes(self, planes: NDArray[np.uint8]) -> bool:
         """Read the next frame into `planes`; False at the end of the stream."""
@@ -145,16 +142,10 @@ class LiveStream:
         self._lock = threading.Lock()
         self._killed = threading.Event()
         self._process: _LiveProcess | None = None
-        self._ended_cpu_seconds = 0.0
+        self.cpu_seconds = 0.0  # processor time of the processes that have ended
         self._number = -1  # of the last frame
         self.info = self._open(None)
         self._opened = self._last_read = time.monotonic()
-
-    @property
-    def cpu_seconds(self) -> float:
-        """Processor time of ffmpeg, known after it has ended."""
-        current = 0.0 if self._process is None else self._process.process.cpu_seconds
-        return self._ended_cpu_seconds + current
 
     def _open(self, like: VideoInfo | None) -> VideoInfo:
         """Start ffmpeg, in place of one that has ended."""
@@ -177,7 +168,7 @@ class LiveStream:
     def _end_process(self) -> None:
         if self._process is not None:
             self._process.process.close()
-            self._ended_cpu_seconds += self._process.process.cpu_seconds
+            self.cpu_seconds += self._process.process.cpu_seconds
             self._process = None
 
     def read(self, planes: NDArray[np.uint8]) -> int | None:
@@ -227,7 +218,7 @@ class LiveStream:
 
     def reason(self) -> str:
         """Last message of ffmpeg."""
-        return "no reason given" if self._process is None else self._process.reason()
+        return last_line("" if self._process is None else self._process.process.log())
 
     def kill(self) -> None:
         """End ffmpeg at once, from any thread; a thread that reads sees the end."""
@@ -258,83 +249,59 @@ class LiveReader(Reader):
         height, width = self.info.shape[:2]
         self._planes_shape = (height * 3 // 2, width)
         self._channels = np.empty((3, height, width), np.uint8)
-        self._changed = threading.Condition()
-        self._newest: tuple[int, NDArray[np.uint8]] | None = None
-        self._finished = self._killed = False
-        self._error: BaseException | None = None  # of the thread
+        self._killed = False
+        self._newest: ClosableQueue[tuple[int, NDArray[np.uint8]]] = ClosableQueue(1)
         self._thread = None
+        self._frames = self._read()
         if drop:
             self._thread = threading.Thread(target=self._read_all, name="vehicle-live", daemon=True)
+            self._frames = iter(self._newest)
             self._thread.start()
 
-    @property
-    def cpu_seconds(self) -> float:
-        """Processor time of ffmpeg, known after it has ended."""
-        return self._stream.cpu_seconds
-
     def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
-        number, planes = self._next_planes()
+        try:
+            number, planes = next(self._frames)
+        except QueueClosed:
+            raise StopIteration from None
+        except StopIteration:
+            if self._killed or self._number >= self._first:
+                raise
+            start = float(self._first / self.info.fps)
+            raise VideoError(
+                f"{self._stream.name} has no frame after {start:g} s ({self._stream.reason()})"
+            ) from None
         frame = rgb_from_planes(planes, ColorEncoding(), self._channels)
         return number, float(number / self.info.fps), frame
 
-    def _next_planes(self) -> tuple[int, NDArray[np.uint8]]:
-        if self._thread is None:
-            planes = self._read()
-        else:
-            with self._changed:
-                while self._newest is None and not self._finished:
-                    self._changed.wait()
-                planes, self._newest = self._newest, None
-                self._changed.notify_all()
-        if planes is None:
-            if self._error is not None and not self._killed:
-                raise self._error
-            self._finish()
-            raise StopIteration
-        return planes
-
-    def _read(self) -> tuple[int, NDArray[np.uint8]] | None:
-        """Read the next frame of the range; None at its end."""
+    def _read(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Yield the numbers and planes of the frames of the range."""
         while not self._killed and self._number + 1 < self._end:
             planes = np.empty(self._planes_shape, np.uint8)
             number = self._stream.read(planes)
             if number is None:
-                return None
+                return
             self._number = number
             if self._first <= number < self._end:
-                return number, planes
-        return None
+                yield number, planes
 
     def _read_all(self) -> None:
-        """Read until the end of the stream, and keep the newest frame; the first one until it is taken."""
+        """Read until the end of the stream, and keep the first frame until it is taken, then the newest."""
+        error = None
         try:
-            first = item = self._read()
-            while item is not None:
-                with self._changed:
-                    self._newest = item
-                    self._changed.notify_all()
-                    while self._newest is first and not self._killed:
-                        self._changed.wait()
-                item = self._read()
-        except BaseException as error:  # raised in the thread of the consumer
-            self._error = error
+            for count, item in enumerate(self._read()):
+                self._newest.put(item, replace=count > 1)
+        except QueueClosed:
+            pass
+        except BaseException as caught:  # raised in the thread of the consumer
+            error = None if self._killed else caught
         finally:
-            with self._changed:
-                self._finished = True
-                self._changed.notify_all()
-
-    def _finish(self) -> None:
-        """Raise an error if the stream had no frame of the range."""
-        if not self._killed and self._number < self._first:
-            start = float(self._first / self.info.fps)
-            raise VideoError(f"{self._stream.name} has no frame after {start:g} s ({self._stream.reason()})")
+            self._newest.finish(error)
 
     def kill(self) -> None:
         """End ffmpeg at once, from any thread; a thread that reads sees the end."""
         self._killed = True
         self._stream.kill()
-        with self._changed:
-            self._changed.notify_all()
+        self._newest.abort()
 
     def close(self) -> None:
         """End ffmpeg and the thread."""
@@ -342,3 +309,4 @@ class LiveReader(Reader):
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
         self._stream.close()
+        self.cpu_seconds = self._stream.cpu_seconds

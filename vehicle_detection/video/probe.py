@@ -35,6 +35,7 @@ from vehicle_detection.video.yuv import ColorEncoding
 # Containers in which ffmpeg's time 0 is the start of the only stream that is read, not that of the file.
 _OWN_STARTS = ("mpegts", "mpeg", "hls", "ogg")
 _STREAM_START = r", start (-?[\d.]+)"
+_FIRST_FRAME = r"n: *0 .*?pts_time:(\S+).*? s:(\d+)x(\d+)"
 # Containers whose duration counts from time 0 instead of from the file's start.
 _DURATION_IS_END = ("matroska,webm", "flv")
 # Rate in Hz above which a rate may be that of a clock, or of frames that arrive in bursts.
@@ -52,25 +53,18 @@ class VideoInfo:
     width, height
         Size of a frame in pixels, after the rotation stored in the file. The width of anamorphic video, whose
         stored pixels are not square, is that of frames with square pixels.
-    fps
-        Exact frame rate, such as 30000/1001; ``float(info.fps)`` is 29.97. If the file's rate varies, the
-        constant rate to which its frames are converted.
-    frames
-        Number of frames, estimated from the duration; 0 if unknown.
-    duration
-        Length in seconds; 0.0 if unknown.
+    fps, constant_rate
+        Exact frame rate, such as 30000/1001, and whether it is the file's; if the file's rate varies, it is
+        the constant rate to which its frames are converted.
+    frames, duration
+        Number of frames, estimated from the length in seconds; 0 if unknown.
     rotation
         Clockwise rotation in degrees from the stored frames to upright ones.
-    constant_rate
-        Whether the file's frame rate is constant.
     start_time
         Time of the first frame in seconds after the file's start, if the sound starts earlier; otherwise 0.0.
-    pixel_format
-        ffmpeg's name of the pixel format, such as ``"yuv420p"``; empty if unknown.
-    color_encoding
-        How luma and chroma encode colors.
-    container
-        ffmpeg's names of the container format, such as ``"matroska,webm"``; empty if unknown.
+    pixel_format, container, color_encoding
+        ffmpeg's names, such as ``"yuv420p"`` and ``"matroska,webm"``, empty if unknown; and how luma and
+        chroma encode colors.
     first_timestamp
         Timestamp of the first frame in seconds, as stored in the file.
     video_offset, audio_offset
@@ -124,69 +118,57 @@ def probe(path: Path | str) -> VideoInfo:
 
 
 def _probe(path: Path | str) -> VideoInfo:
-    log = _read_log(path)
-    index = int(_find(r"Stream #0:(\d+)", log.decoded, "0"))
-    stream = _stream_lines(log.header, index)
-    fps, constant = frame_rate(log.decoded, stream)
-    if log.container == "matroska,webm":  # its header may state a wrong rate
+    header, decoded, container = _read_log(path)
+    moment, width, height = _find_all(_FIRST_FRAME, decoded)
+    index = int(_find(r"Stream #0:(\d+)", decoded, "0"))
+    stream = _find(rf"^(  Stream #0:{index}\b[\s\S]*?)(?=^  Stream #|\Z)", header, "")
+    fps, constant = frame_rate(decoded, stream)
+    if container == "matroska,webm":  # its header may state a wrong rate
         fps, constant = _rate_of_times(fps, _frame_times(path))
-    begin = float(_find(r"^  Duration: .*?, start: (-?[\d.]+)", log.header, "0"))
-    duration = seconds_of(_find(r"^  Duration: ([\d:.]+)", log.header, "0:0:0"))
-    if log.container in _DURATION_IS_END:
+    begin = float(_find(r"^  Duration: .*?, start: (-?[\d.]+)", header, "0"))
+    duration = seconds_of(_find(r"^  Duration: ([\d:.]+)", header, "0:0:0"))
+    if container in _DURATION_IS_END:
         duration = max(duration - begin, 0.0)
-    audio = re.findall(r"^  Stream #0:(\d+).*?: Audio: (\w+)(.*)", log.header, re.MULTILINE)
+    audio = re.findall(r"^  Stream #0:(\d+).*?: Audio: (\w+)(.*)", header, re.MULTILINE)
     track = next((number for number, (_, codec, _) in enumerate(audio) if codec != "none"), None)
     audio_index, audio_codec, audio_text = ("", None, "") if track is None else audio[track]
     video_offset, audio_offset = 0.0, 0.0
-    if log.container in _OWN_STARTS:
+    if container in _OWN_STARTS:
         video_offset = float(_find(_STREAM_START, stream, str(begin))) - begin
         audio_offset = float(_find(_STREAM_START, audio_text, str(begin))) - begin
     # With a varying rate, the gap before the first frame is filled with copies of it.
-    start_time = video_offset + (log.frame_time if constant else 0.0)
+    start_time = video_offset + (float(moment) if constant and moment[-1].isdigit() else 0.0)
     # The duration in AVI files is that of the frames.
-    length = duration if log.container == "avi" else max(duration - start_time, 0.0)
-    sound = re.search(r", (\d+) Hz, ([^,]+)", audio_text)
-    colors = re.search(r"color_range:(\w+) color_space:(\w+)", log.decoded)
+    length = duration if container == "avi" else max(duration - start_time, 0.0)
+    sound = _find_all(r", (\d+) Hz, ([^,]+)", audio_text)
+    colors = _find_all(r"color_range:(\w+) color_space:(\w+)", decoded)
     return VideoInfo(
-        width=log.size[0],
-        height=log.size[1],
+        width=int(width),
+        height=int(height),
         fps=fps,
         frames=round(length * fps),
         duration=duration,
         rotation=round(-float(_find(r"rotation of (-?[\d.]+) degrees", stream, "0"))) % 360,
         constant_rate=constant,
         start_time=start_time,
-        pixel_format=_find(r"n: *0 .*? fmt:(\w+)", log.decoded, ""),
-        color_encoding=ColorEncoding(colors[2], colors[1] == "pc") if colors else ColorEncoding(),
-        container=log.container,
+        pixel_format=_find(r"n: *0 .*? fmt:(\w+)", decoded, ""),
+        color_encoding=ColorEncoding(colors[1], colors[0] == "pc") if colors else ColorEncoding(),
+        container=container,
         first_timestamp=begin + start_time,
         video_offset=video_offset,
         audio_offset=audio_offset,
         audio_track=track,
         audio_codec=audio_codec,
-        audio_format=()
-        if audio_codec is None
-        else (audio_index, audio_codec, *(sound.groups() if sound else ())),
+        audio_format=() if audio_codec is None else (audio_index, audio_codec, *sound),
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Log:
-    """ffmpeg's log of the first frame, with square pixels.
+def _read_log(path: Path | str) -> tuple[str, str, str]:
+    """Decode the first frame of a video, with square pixels; raise a VideoError if there is none.
 
-    `header` describes the file, `decoded` the filter graph and the frame. `size` is the frame's width and
-    height, `frame_time` its time in seconds.
+    Returns the part of ffmpeg's log that describes the file, the part about the filters and the frame, and
+    the names of the container.
     """
-
-    header: str
-    decoded: str
-    container: str
-    size: tuple[int, int]
-    frame_time: float
-
-
-def _read_log(path: Path | str) -> _Log:
-    """Decode the first frame of a video; raise a VideoError if there is none."""
     # "V" excludes cover pictures. Only the showinfo filter prints the exact frame rate.
     options = ("-map", "0:V:0", "-frames:v", "1", "-vf", f"{SQUARE_PIXELS},showinfo", "-f", "null", "-")
     source = ("-nostdin", *pixel_limit(), *input_options(path))
@@ -209,24 +191,21 @@ def _read_log(path: Path | str) -> _Log:
         raise video_error(message, path, code, log)
     if not mapped:
         raise VideoError(f"{name} has no video track; choose a file with one")
-    frame = re.search(r"n: *0 .*?pts_time:(\S+).*? s:(\d+)x(\d+)", decoded)
-    if frame is None:
+    if not _find_all(_FIRST_FRAME, decoded):
         message = f"{name} has no frame that can be decoded ({last_line(log)}); copy it again"
         raise video_error(message, path, code, log)
-    moment, width, height = frame.groups()
-    return _Log(
-        header=header,
-        decoded=decoded,
-        container=container,
-        size=(int(width), int(height)),
-        frame_time=float(moment) if moment[-1].isdigit() else 0.0,
-    )
+    return header, decoded, container
+
+
+def _find_all(pattern: str, text: str) -> tuple[str, ...]:
+    """Return what a pattern's groups find first; empty if they find nothing."""
+    found = re.search(pattern, text, re.MULTILINE)
+    return found.groups() if found else ()
 
 
 def _find(pattern: str, text: str, default: str) -> str:
-    """Return what a pattern's group finds."""
-    found = re.search(pattern, text, re.MULTILINE)
-    return found[1] if found else default
+    """Return what a pattern's group finds first."""
+    return next(iter(_find_all(pattern, text)), default)
 
 
 def _is_text(path: Path) -> bool:
@@ -241,20 +220,11 @@ def _is_text(path: Path) -> bool:
     return bool(start) and not control and len(text.encode()) >= len(start) - 3
 
 
-def _stream_lines(header: str, index: int) -> str:
-    """Lines of ffmpeg's log that describe one stream of a file."""
-    for block in re.split(r"^(?=  Stream #)", header, flags=re.MULTILINE):
-        if re.match(rf"  Stream #0:{index}\b", block):
-            return block
-    return ""
-
-
 def frame_rate(decoded: str, stream: str) -> tuple[Fraction, bool]:
     """Frame rate, and whether it is constant, from ffmpeg's log."""
-    exact = re.search(r"frame_rate: (\d+)/(\d+)", decoded)
-    printed = re.search(r"([\d.]+)(k?) fps", stream)
-    mean = Fraction(printed[1]) * (1000 if printed[2] else 1) if printed else Fraction(0)
-    rate = Fraction(int(exact[1]), int(exact[2])) if exact and int(exact[1]) and int(exact[2]) else mean
+    exact, printed = _find_all(r"frame_rate: (\d+)/(\d+)", decoded), _find_all(r"([\d.]+)(k?) fps", stream)
+    mean = Fraction(printed[0]) * (1000 if printed[1] else 1) if printed else Fraction(0)
+    rate = Fraction(int(exact[0]), int(exact[1])) if exact and int(exact[0]) and int(exact[1]) else mean
     if not rate:
         return Fraction(25), False
     # Tolerance: ffmpeg prints the mean rate with two decimals.

@@ -63,11 +63,8 @@ class Reader(Closing):
     info: VideoInfo
     damage: str = ""
     """What is damaged in the source; known after the last frame, and empty if nothing is."""
-
-    @property
-    def cpu_seconds(self) -> float:
-        """Processor time of ffmpeg, known after it has ended."""
-        return 0.0
+    cpu_seconds: float = 0.0
+    """Processor time of ffmpeg, known after it has ended."""
 
     def __iter__(self) -> Self:
         return self
@@ -85,11 +82,10 @@ class Reader(Closing):
 
 
 class FrameReader(Reader):
-    """Frames of a video file, as `read_frames` returns it.
+    """Frames of a video file, as `read_frames` returns it; ffmpeg ends after the last one, or on `close`.
 
-    ffmpeg ends after the last frame, on :meth:`close`, at the end of a ``with`` block, and when the reader is
-    deleted. After the last frame, `damage` says what is damaged, such as missing frames, which is also logged
-    as a warning; with `strict` it is raised as an error instead.
+    Damage is logged as a warning; with `strict` it is raised as an error. With `whole`, missing frames at the
+    end are an error.
     """
 
     def __init__(
@@ -152,52 +148,42 @@ class FrameReader(Reader):
 
     def _finish(self) -> None:
         """Close ffmpeg after its last frame; raise an error if frames are missing."""
-        code = self._process.wait()
-        log = self._process.log()
+        code, log = self._process.wait(), self._process.log()
         self.close()
         if self._killed:
             return
         end, name = self._first + self.frames_read, source_name(self._path)
-        complete = self._count is not None and self.frames_read >= self._count
+        start = float(self._first / self.info.fps)
         incomplete = ""
-        if not complete:
+        if self._count is None or self.frames_read < self._count:
             check_resources(name, code, log)
-        if not complete and end < self.info.frames - 1 and _TRUNCATED.search(log):
-            incomplete = f"{name} is incomplete: {end} of about {self.info.frames} frames can be decoded"
-        if incomplete and not self.frames_read:
-            start = float(self._first / self.info.fps)
-            incomplete = f"{name} is incomplete: no frame after {start:g} s can be decoded"
+            if end < self.info.frames - 1 and _TRUNCATED.search(log):
+                known = f"{end} of about {self.info.frames} frames" if self.frames_read else ""
+                incomplete = f"{name} is incomplete: {known or f'no frame after {start:g} s'} can be decoded"
+            elif code:
+                message = (
+                    f"{name} cannot be decoded after frame {end}: {exit_reason(code, log)}; "
+                    "if this happens again, copy the file again"
+                )
+                raise video_error(message, self._path, code, log)
         if incomplete and isinstance(self._path, str):  # the server or the network may be to blame
             raise video_error(f"{incomplete}; try again", self._path, code, log)
         if incomplete and self._whole:
             raise VideoError(f"{incomplete}; copy it again, or leave it out")
-        if code and not complete and not incomplete:
-            message = (
-                f"{name} cannot be decoded after frame {end}: {exit_reason(code, log)}; "
-                "if this happens again, copy the file again"
-            )
-            raise video_error(message, self._path, code, log)
         if not self.frames_read:
-            start = float(self._first / self.info.fps)
             what = incomplete or f"{name} has no frame after {start:g} s"
             raise VideoError(f"{what}; choose an earlier start")
-        # After a jump into the file, the first frames may refer to frames before it, which is no damage.
-        errors = "" if self._sought else log
-        stop = None if self._count is None else self._first + self._count
-        self.damage = (
-            f"{incomplete}; copy it again"
-            if incomplete
-            else find_damage(self._path, self.info, end, errors, stop=stop)
-        )
+        if incomplete:
+            self.damage = f"{incomplete}; copy it again"
+        else:
+            # After a jump into the file, the first frames may refer to frames before it: this is no damage.
+            errors = "" if self._sought else log
+            stop = None if self._count is None else self._first + self._count
+            self.damage = find_damage(self._path, self.info, end, errors, stop=stop)
         if self.damage and self._strict:
             raise VideoError(self.damage)
         if self.damage:
             _LOGGER.warning("%s", self.damage)
-
-    @property
-    def cpu_seconds(self) -> float:
-        """Processor time of ffmpeg, known after it has ended."""
-        return self._process.cpu_seconds
 
     def kill(self) -> None:
         """End ffmpeg at once, from any thread; a thread that reads sees the end of the video."""
@@ -207,6 +193,7 @@ class FrameReader(Reader):
     def close(self) -> None:
         """End ffmpeg if it is still running."""
         self._process.close()
+        self.cpu_seconds = self._process.cpu_seconds
 
     def __del__(self) -> None:
         if hasattr(self, "_process"):
@@ -347,22 +334,11 @@ def frame_range(info: VideoInfo, start: float | None, end: float | None) -> tupl
 class AudioSource:
     """Sound for a written video.
 
-    Attributes
-    ----------
-    input
-        Options of ffmpeg that open it.
-    start
-        Time of the first written frame in the file in seconds.
-    audio_offset
-        Time in the file that is ffmpeg's time 0; later than `start` if the sound starts later.
-    length
-        Maximum length in seconds; None for all.
-    copyable
-        Whether it may be copied without decoding: it is the whole track of one file.
+    `input` holds ffmpeg's options that open it.
     """
 
     input: tuple[str, ...]
-    start: float = 0.0
-    audio_offset: float = 0.0
-    length: float | None = None
-    copyable: bool = False
+    start: float = 0.0  # time (s) of the first written frame in the file
+    audio_offset: float = 0.0  # time (s) in the file that is ffmpeg's time 0
+    length: float | None = None  # maximum (s)
+    copyable: bool = False  # without decoding: it is the whole track of one file

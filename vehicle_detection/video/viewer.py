@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import time
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,21 +13,30 @@ from numpy.typing import NDArray
 from vehicle_detection._common import in_notebook
 from vehicle_detection.errors import InvalidInputError
 
-# Seconds between pictures, and largest width in a notebook, which stores and sends each of them.
-_WINDOW_INTERVAL, _NOTEBOOK_INTERVAL = 1 / 30, 0.1
+# Largest width in a notebook, which stores and sends each picture.
 _NOTEBOOK_WIDTH = 960
 # Fraction of the screen that a window may take.
 _SCREEN_FRACTION = 0.9
 
 
-class Viewer(Protocol):
-    """Shows one frame after the other."""
+class Viewer:
+    """Shows one frame after the other, scaled down to `_size`, and at most one in `_interval` seconds."""
 
-    closed: bool
+    closed = False
     """Whether the user has closed the window."""
+    _interval: float
+    _size: tuple[int, int]
+    _last = -np.inf
 
     def show(self, frame: NDArray[np.uint8]) -> None:
         """Show an ``(H, W, 3)`` uint8 RGB frame; frames that follow too fast are left out."""
+        now = time.monotonic()
+        if not self.closed and now - self._last >= self._interval:
+            self._last = now
+            self._show(_fit(frame, *self._size))
+
+    def _show(self, frame: NDArray[np.uint8]) -> None:
+        raise NotImplementedError
 
     def close(self) -> None:
         """Close the window; a picture in a notebook stays."""
@@ -38,8 +47,10 @@ def open_viewer(title: str) -> Viewer:
     return NotebookViewer() if in_notebook() else WindowViewer(title)
 
 
-class WindowViewer:
+class WindowViewer(Viewer):
     """A window of tkinter, which belongs to Python; OpenCV's headless package has none."""
+
+    _interval = 1 / 30
 
     def __init__(self, title: str) -> None:
         try:
@@ -61,18 +72,11 @@ class WindowViewer:
         self._root.bind("<Escape>", lambda _: self.close())
         self._label = tkinter.Label(self._root)
         self._label.pack()
-        screen = self._root.winfo_screenwidth(), self._root.winfo_screenheight()
-        self._width, self._height = (int(side * _SCREEN_FRACTION) for side in screen)
-        self._last = -np.inf
-        self.closed = False
+        width, height = self._root.winfo_screenwidth(), self._root.winfo_screenheight()
+        self._size = int(width * _SCREEN_FRACTION), int(height * _SCREEN_FRACTION)
 
-    def show(self, frame: NDArray[np.uint8]) -> None:
-        """Show a frame, scaled down to the screen, and process the window's events."""
-        now = time.monotonic()
-        if self.closed or now - self._last < _WINDOW_INTERVAL:
-            return
-        self._last = now
-        frame = _fit(frame, self._width, self._height)
+    def _show(self, frame: NDArray[np.uint8]) -> None:
+        """Show a frame, and process the window's events."""
         height, width = frame.shape[:2]
         # The label keeps no reference.
         self._picture = self._tkinter.PhotoImage(data=b"P6 %d %d 255 " % (width, height) + frame.tobytes())
@@ -86,32 +90,23 @@ class WindowViewer:
             self._root.destroy()
 
 
-class NotebookViewer:
+class NotebookViewer(Viewer):
     """A picture in the output of a cell, which is replaced."""
 
-    closed = False
+    _interval = 0.1
+    _size = _NOTEBOOK_WIDTH, _NOTEBOOK_WIDTH
 
     def __init__(self) -> None:
         self._display: Any = importlib.import_module("IPython.display")
         self._handle: Any = None
-        self._last = -np.inf
 
-    def show(self, frame: NDArray[np.uint8]) -> None:
-        """Replace the picture."""
-        now = time.monotonic()
-        if now - self._last < _NOTEBOOK_INTERVAL:
-            return
-        self._last = now
-        frame = _fit(frame, _NOTEBOOK_WIDTH, _NOTEBOOK_WIDTH)
+    def _show(self, frame: NDArray[np.uint8]) -> None:
         _, data = cv2.imencode(".jpg", np.ascontiguousarray(frame[..., ::-1]))
         picture = self._display.Image(data=data.tobytes(), format="jpeg")
         if self._handle is None:
             self._handle = self._display.display(picture, display_id=True)
         else:
             self._handle.update(picture)
-
-    def close(self) -> None:
-        """Keep the last picture."""
 
 
 def _fit(frame: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:

@@ -30,16 +30,10 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.tracking import FrameResult
-from vehicle_detection.video.engine import (
-    ClosableQueue,
-    QueueClosed,
-    TrackRun,
-    VideoDetector,
-    VideoReport,
-    track,
-)
+from vehicle_detection.video.engine import TrackRun, VideoDetector, VideoReport, track
 from vehicle_detection.video.ffmpeg import Process, exit_reason
 from vehicle_detection.video.probe import VideoInfo
+from vehicle_detection.video.queues import ClosableQueue, QueueClosed
 from vehicle_detection.video.reading import AudioSource, check_span, frame_range
 from vehicle_detection.video.sources import Source, borrow_source
 from vehicle_detection.video.viewer import open_viewer
@@ -193,7 +187,7 @@ def write_video(
     show: bool = False,
     on_result: Callable[[FrameResult], object] | None = None,
 ) -> VideoReport:
-    """Draw the results of `track` on their frames, and write them to a video.
+    """Draw the results of `track` on their frames, and write them to a video; a `VideoError` if that fails.
 
     The video is H.264 in yuv420p, which browsers play, with the frame rate, all frames and the sound of the
     source. The rotation stored in the source is applied. A varying frame rate is converted to a constant one.
@@ -220,18 +214,6 @@ def write_video(
     on_result
         Function that is called with each result, without its frame, in frame order, in the calling thread.
 
-    Returns
-    -------
-    VideoReport
-        Numbers of frames and vehicles, and the time of each stage.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is invalid.
-    VideoError
-        If the source is not a video, or the target cannot be written.
-
     Examples
     --------
     >>> from vehicle_detection import VehicleDetector, track, write_video
@@ -245,9 +227,8 @@ def write_video(
         check_flags(audio=audio, show=show)
         if on_result is not None and not callable(on_result):
             raise InvalidInputError(f"on_result must be a function of a result, got {describe(on_result)}")
-        started, drawing, sink, viewer = time.perf_counter(), None, None, None
-        if target is not None or show:
-            drawing = _Drawing(annotator, results)
+        started, sink, viewer = time.perf_counter(), None, None
+        drawing = None if target is None and not show else _Drawing(annotator, results)
         if drawing is not None and target is not None:
             output = check_video_target(target, results.source.files, preset=preset)
             sound = results.sound() if audio else None
@@ -310,18 +291,6 @@ def process_video(
     detector
         A `VehicleDetector`, or another object with its methods ``search``, ``track`` and ``reset``; its
         ``annotator`` draws.
-
-    Returns
-    -------
-    VideoReport
-        Numbers of frames and vehicles, and the time of each stage.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is invalid.
-    VideoError
-        If the source is not a video, or the target cannot be written.
 
     Examples
     --------
@@ -454,10 +423,7 @@ def cut_video(
     end: float | None = None,
     preset: str = "veryfast",
 ) -> int:
-    """Copy a part of a video, with its sound, to another file; returns the number of frames.
-
-    The arguments are those of `process_video`, and so are the errors.
-    """
+    """Copy a part of a video, with its sound, to another file; returns the number of frames."""
     start, end = check_span(start, end)
     with borrow_source(source) as opened:
         output = check_video_target(target, opened.files, preset=preset)
