@@ -14,9 +14,6 @@ from PIL import Image
 from vehicle_detection.errors import InvalidInputError, OutputError
 from vehicle_detection.images import decode_image, image_size, read_image, write_image
 
-LOSSLESS = [".png", ".bmp", ".tiff"]
-LOSSY = [".jpg", ".webp"]
-
 
 @pytest.fixture(scope="module")
 def picture():
@@ -50,22 +47,19 @@ def test_the_content_of_a_file_is_an_image(tmp_path, picture, monkeypatch):
         read_image(data)
 
 
-@pytest.mark.parametrize("suffix", LOSSLESS)
-def test_lossless_formats_keep_every_value(tmp_path, picture, suffix):
-    write_image(tmp_path / f"a{suffix}", picture)
-    image = read_image(tmp_path / f"a{suffix}")
-    np.testing.assert_array_equal(image, picture)
-    assert image.dtype == np.uint8
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".JPG", ".WEBP"])
+def test_an_image_is_unchanged_after_writing_and_reading(tmp_path, picture, suffix):
+    """Lossy formats keep it approximately."""
+    before, path = picture.copy(), tmp_path / f"a{suffix}"
+    write_image(str(path), picture)
+    np.testing.assert_array_equal(picture, before)
+    image = read_image(path)
+    assert (image.shape, image.dtype) == (picture.shape, np.uint8)
     assert image.flags.c_contiguous
     assert image.flags.writeable
-
-
-@pytest.mark.parametrize("suffix", LOSSY)
-def test_lossy_formats_keep_the_image_approximately(tmp_path, picture, suffix):
-    write_image(str(tmp_path / f"a{suffix.upper()}"), picture)
-    image = read_image(str(tmp_path / f"a{suffix.upper()}"))
-    assert image.shape == picture.shape
-    assert np.abs(image.astype(int) - picture).mean() < 3
+    assert np.abs(image.astype(int) - picture).mean() < (3 if suffix.isupper() else 1e-9)
+    write_image(path, picture[::2, ::2])
+    assert np.abs(read_image(path).astype(int) - picture[::2, ::2]).mean() < 5
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff"])
@@ -86,11 +80,6 @@ def test_a_name_that_is_not_utf8(tmp_path):
     np.testing.assert_array_equal(read_image(path), image)
 
 
-def test_alpha_is_dropped(picture):
-    with_alpha = np.dstack([bgr(picture), np.full((40, 60), 30, np.uint8)])
-    np.testing.assert_array_equal(decode_image(encoded(".png", with_alpha), "rgba"), picture)
-
-
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_sixteen_bits_are_scaled_to_eight(suffix, channels):
@@ -104,12 +93,14 @@ def test_sixteen_bits_are_scaled_to_eight(suffix, channels):
     assert (image.min(), image.max()) == (0, 255)
 
 
-def test_a_palette_becomes_rgb(picture):
+def test_a_palette_becomes_rgb_and_alpha_is_dropped(picture):
     buffer = io.BytesIO()
     indexed = Image.fromarray(picture).quantize(16)
     indexed.save(buffer, "PNG")
     expected = np.array(indexed.convert("RGB"))
     np.testing.assert_array_equal(decode_image(buffer.getvalue(), "indexed"), expected)
+    with_alpha = np.dstack([bgr(picture), np.full((40, 60), 30, np.uint8)])
+    np.testing.assert_array_equal(decode_image(encoded(".png", with_alpha), "rgba"), picture)
 
 
 @pytest.mark.parametrize(("orientation", "turns"), [(1, 0), (3, 2), (6, 3), (8, 1)])
@@ -132,9 +123,7 @@ def test_a_truncated_file_is_refused(tmp_path, picture, suffix, fraction):
     data = encoded(suffix, bgr(picture))
     file = tmp_path / f"cut{suffix}"
     file.write_bytes(data[: int(len(data) * fraction)])
-    with pytest.raises(
-        InvalidInputError, match=r"image file .*cut.* must be a complete image file .*decoded"
-    ):
+    with pytest.raises(InvalidInputError, match=r"image file .*cut.* must be a complete image .*decoded"):
         read_image(file)
 
 
@@ -175,7 +164,7 @@ def claim(data, width, height):
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-@pytest.mark.parametrize("side", [30_000, 20_000, 11_000])
+@pytest.mark.parametrize("side", [30_000, 11_000])
 def test_an_image_that_claims_to_be_huge_is_refused_before_it_is_decoded(picture, monkeypatch, suffix, side):
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
     message = rf"huge must have at most 120,000,000 pixels, got {side}x{side}; .*VEHICLE_DETECTION_MAX_PIXELS"
@@ -192,9 +181,7 @@ def test_the_limit_of_pixels_is_adjustable(picture, monkeypatch):
         decode_image(data, "a.png")
     for text in ("many", "0", "-1", "1" * 30):
         monkeypatch.setenv("VEHICLE_DETECTION_MAX_PIXELS", text)
-        with pytest.raises(
-            InvalidInputError, match="VEHICLE_DETECTION_MAX_PIXELS must be a number of pixels"
-        ):
+        with pytest.raises(InvalidInputError, match="_MAX_PIXELS must be a number of pixels"):
             decode_image(data, "a.png")
 
 
@@ -261,14 +248,6 @@ def test_a_failed_write_keeps_the_earlier_file(tmp_path, picture, monkeypatch):
         write_image(tmp_path / "a.png", 255 - picture)
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), picture)
-
-
-def test_writing_does_not_change_the_image(tmp_path, picture):
-    before = picture.copy()
-    write_image(tmp_path / "a.png", picture)
-    write_image(tmp_path / "b.png", picture[::2, ::2])
-    np.testing.assert_array_equal(picture, before)
-    np.testing.assert_array_equal(read_image(tmp_path / "b.png"), picture[::2, ::2])
 
 
 @pytest.mark.parametrize(

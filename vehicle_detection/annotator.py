@@ -99,10 +99,10 @@ class DrawParams(Checked):
         ``"id"``: each track has a color of its own. ``"distance"``: from vermilion (10 m and nearer) over
         orange (20 m) and yellow (35 m) to blue (60 m and farther), gray where the distance is unknown.
     panel
-        Bird's-eye view of the tracks in a video: ``"corner"``, in the frame's upper right corner; ``"side"``,
-        to the right of the frame, which makes the video wider; or ``"none"``.
+        Bird's-eye view in the frame's upper right ``"corner"``, or at its right ``"side"``, which makes the
+        video wider; or ``"none"``.
     units
-        Units of labels and bird's-eye view: ``"metric"`` (m and km/h) or ``"imperial"`` (ft and mph).
+        ``"metric"`` (m and km/h) or ``"imperial"`` (ft and mph), in labels and bird's-eye view.
 
     >>> DrawParams(labels=("id", "distance"), color_by="distance").panel
     'none'
@@ -175,25 +175,6 @@ def road_position(track: Track, camera: Camera, shape: tuple[int, ...]) -> RoadP
     )
 
 
-class Trails:
-    """Positions of tracks in the last frames."""
-
-    def __init__(self) -> None:
-        self._trails: dict[int, Trail] = {}
-
-    def update(self, time: float, points: Mapping[int, Point | None]) -> dict[int, Trail]:
-        """Add the points of a frame by track id, at most one per 0.08 s; return all trails."""
-        trails = {key: self._trails.get(key) or deque() for key in points}
-        for key, trail in trails.items():
-            point = points[key]
-            if point is not None and not (trail and time < trail[-1][0] + _TRAIL_STEP):
-                trail.append((time, point))
-            while trail and trail[0][0] < time - TRAIL_SECONDS:
-                trail.popleft()
-        self._trails = trails
-        return trails
-
-
 class BirdsEyePanel:
     """Draws a bird's-eye view into frames of ``(height, width, ...)``: in their corner, or beside them."""
 
@@ -214,7 +195,7 @@ class BirdsEyePanel:
         self._has_text = height >= _MIN_TEXT_HEIGHT
         self._grid = self._draw_grid(height, width, units)
         self._dark = (self._grid * _BACKGROUND_ALPHA).astype(np.uint8)
-        self._trails = Trails()
+        self._trails: dict[int, Trail] = {}  # by track id
 
     @staticmethod
     def side_size(shape: tuple[int, ...]) -> tuple[int, int]:
@@ -244,7 +225,7 @@ class BirdsEyePanel:
         view[:] = self._grid if self._place == "side" else cv2.add(cv2.LUT(view, _DIMMED), self._dark)
         positions = {track.id: road_position(track, camera, shape) for track in tracks}
         points = {key: position and self._point(*position[:2]) for key, position in positions.items()}
-        trails = self._trails.update(time, points)
+        self._update_trails(time, points)
         shown = [
             (position, track, color)
             for track, color in zip(tracks, colors, strict=True)
@@ -255,13 +236,23 @@ class BirdsEyePanel:
         for position, _, color in shown:
             self._draw_ellipse(view, position, color)
         for position, track, color in shown:
-            trail = [*(point for _, point in trails[track.id]), points[track.id]]
+            trail = [*(point for _, point in self._trails[track.id]), points[track.id]]
             cv2.polylines(view, [np.array(trail, np.int32)], False, color, self._line, cv2.LINE_AA, _SHIFT)
             self._draw_vehicle(view, track, position, color, camera)
         if self._has_text:
             for position, track, _ in shown:
                 self._write_number(view, track, position)
         return left, 0, left + width, height
+
+    def _update_trails(self, time: float, points: Mapping[int, Point | None]) -> None:
+        """Add the points of a frame, at most one per 0.08 s and track."""
+        self._trails = {key: self._trails.get(key) or deque() for key in points}
+        for key, trail in self._trails.items():
+            point = points[key]
+            if point is not None and not (trail and time < trail[-1][0] + _TRAIL_STEP):
+                trail.append((time, point))
+            while trail and trail[0][0] < time - TRAIL_SECONDS:
+                trail.popleft()
 
     def _draw_grid(self, height: int, width: int, units: str) -> Image:
         """Draw lanes, lines across the road with their distances, and the own car."""
@@ -485,13 +476,11 @@ def draw_tracks(
     line_width: int | None = None,
     color_by: Literal["id", "distance"] = "id",
 ) -> Image:
-    """Draw tracks on a copy of an image, each with a box and a label.
+    """Draw tracks on a copy of an image, each with a box and a label; options as in `DrawParams`.
 
     Only tracks with ``track.shown`` are drawn; those without a detection in this frame have dashed boxes.
     Labels are placed where they hide neither other labels nor other vehicles, if necessary on leader lines or
     without their last fields. In a video, an `Annotator` also keeps each label in its place.
-
-    `labels`, `line_width` and `color_by` are those of `DrawParams`.
     """
     style = DrawParams(labels=labels, line_width=line_width, color_by=color_by)
     return Annotator(style).draw_tracks(image, tracks)
@@ -554,16 +543,8 @@ def draw_diagnostics(
 ) -> Image:
     """Draw a 2x2 mosaic of the frame's shape: the frame, its positive windows, the heat map, the tracks.
 
-    Parameters
-    ----------
-    frame, tracks
-        ``(H, W, 3)`` uint8 RGB, and its tracks.
-    windows
-        Positive windows, as `Detections` or boxes in any form that `draw_boxes` accepts.
-    heat
-        ``(h, w)`` finite numbers, of the frame's size or smaller; drawn from black (0) to yellow (maximum).
-    params
-        Labels, units, lines and colors of the tracks; a bird's-eye view is not drawn.
+    `windows` are boxes as in `draw_boxes`; `heat` holds ``(h, w)`` finite numbers, of the frame's size or
+    smaller, drawn from black (0) to yellow (maximum); `params` says how tracks are drawn.
     """
     if params is not None:
         check_type(params, "params", DrawParams, "omit it for the defaults")
@@ -578,17 +559,15 @@ def draw_diagnostics(
     scale = np.array([width, height, width, height]) / np.array(checked.shape[:2] * 2)[[1, 0, 1, 0]]
     boxes = check_boxes(windows)
     scaled = [dataclasses.replace(track, box=track.box * scale) for track in _check_tracks(tracks)]
-    panels = [
-        ("frame", small),
-        ("windows", draw_boxes(small, boxes * scale, color=TRACK_COLORS[1], thickness=1)),
-        ("heat", np.asarray(cv2.resize(heat_image(heat), (width, height)), np.uint8)),
-        (
-            "tracks",
-            Annotator(dataclasses.replace(params or DrawParams(), panel="none")).draw_tracks(small, scaled),
-        ),
-    ]
+    style = dataclasses.replace(params or DrawParams(), panel="none")
+    panels = {
+        "frame": small,
+        "windows": draw_boxes(small, boxes * scale, color=TRACK_COLORS[1], thickness=1),
+        "heat": cv2.resize(heat_image(heat), (width, height)),
+        "tracks": Annotator(style).draw_tracks(small, scaled),
+    }
     mosaic = np.zeros(checked.shape, np.uint8)  # not zeros_like: OpenCV needs rows in C order
-    for index, (title, panel) in enumerate(panels):
+    for index, (title, panel) in enumerate(panels.items()):
         top, left = index // 2 * height, index % 2 * width
         view = mosaic[top : top + height, left : left + width]
         view[:] = panel

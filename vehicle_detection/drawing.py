@@ -39,16 +39,10 @@ BLACK: Color = (0, 0, 0)
 WHITE: Color = (255, 255, 255)
 
 TRACK_COLORS: tuple[Color, ...] = (
-    (230, 159, 0),
-    (86, 180, 233),
-    (0, 158, 115),
-    (240, 228, 66),
-    (0, 114, 178),
-    (213, 94, 0),
-    (204, 121, 167),
-)
+    (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178),
+    (213, 94, 0), (204, 121, 167),
+)  # fmt: skip
 """RGB colors that color-blind viewers can tell apart (Okabe and Ito, *Color Universal Design*, 2008)."""
-
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 # Length of a dash in line widths, and at most as a fraction of a side.
@@ -245,21 +239,20 @@ class LabelPlacer:
             obstacles += [label.rectangle for label in labels if label is not None]
             obstacles += blocked
             for count in range(len(request.fields), 0, -1):
-                lines, size, fitted = _break_lines(
-                    request.fields[:count], request.box, shape[1], scale, last_lines
-                )
+                fields, margin = request.fields[:count], text_margin(scale)
+                lines, size, fitted = _break_lines(fields, request.box, shape[1], scale, last_lines)
+                places = list(_places(request.box, size, shape))
                 # Another number of fields is like another place.
                 before = last_place if last_fields in (None, count) else -1
-                margin, places = text_margin(scale), functools.partial(_places, request.box, size, shape)
                 grows = last_fields is not None and count > last_fields
                 # More fields than before need more space, so that they do not come and go.
-                if grows and _free_place(places(), obstacles, -1, _GROWTH * margin) is None:
+                if grows and _free_place(places, obstacles, -1, _GROWTH * margin) is None:
                     continue
-                found = _free_place(places(), obstacles, before, margin)
+                found = _free_place(places, obstacles, before, margin)
                 if found is not None:
                     break
             else:
-                found = _least_hiding(places(), obstacles, before)
+                found = _least_hiding(places, obstacles, before)
             place, rectangle = found
             labels.append(Label(lines, rectangle, fitted, _leader(request.box, rectangle)))
             last[request.key] = count, len(lines), place

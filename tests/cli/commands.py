@@ -6,8 +6,9 @@ import sys
 
 from typer.testing import CliRunner
 
-from tests.helpers import start_interruptible
+from tests.helpers import rendered_patches, start_interruptible
 from vehicle_detection.cli.app import app
+from vehicle_detection.images import write_image
 
 COMMANDS = ("demo", "detect", "video", "batch", "evaluate", "train", "train-frames", "tune", "fetch", "info")
 HEADER = "frame,track_id,x1,y1,x2,y2,score"
@@ -60,6 +61,14 @@ def finish(process):
 
 def contents(folder):
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
+
+
+def write_patches(folder, count):
+    """Write patches of vehicles and others, for the options that `patches_of` returns."""
+    for number, (patch, label) in enumerate(zip(*rendered_patches(count))):
+        home = folder / ("vehicles" if label else "non-vehicles") / "drawn"
+        home.mkdir(parents=True, exist_ok=True)
+        write_image(home / f"{number}.png", patch)
 
 
 def patches_of(folder):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.helpers import rendered_patches
+from tests.cli.commands import write_patches
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.images import write_image
 from vehicle_detection.scenes import render_drive
@@ -15,11 +15,7 @@ def material(tmp_path_factory):
     drive = render_drive(frames=10, shape=(270, 480), scenario="overtaking")
     draw_clip(drive, folder / "clip.mp4", folder / "labels.csv")
     write_image(folder / "road.png", drive[6].image)
-    patches, labels = rendered_patches(40)
-    for number, (patch, label) in enumerate(zip(patches, labels)):
-        home = folder / ("vehicles" if label else "non-vehicles") / "drawn"
-        home.mkdir(parents=True, exist_ok=True)
-        write_image(home / f"{number}.png", patch)
+    write_patches(folder, 40)
     for name in ("clip.mp4", "road.png"):
         data = (folder / name).read_bytes()
         (folder / f"cut_{name}").write_bytes(data[: len(data) // 2])

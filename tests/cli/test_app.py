@@ -1,11 +1,9 @@
-import errno
 import json
 import os
 import re
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import typer
@@ -16,6 +14,7 @@ from tests.cli.commands import (
     contents,
     failing,
     finish,
+    patches_of,
     refuse,
     refuse_each,
     run,
@@ -103,14 +102,12 @@ def test_ctrl_c_leaves_nothing_behind(tmp_path, material):
         "import vehicle_detection.{module} as module\n"
         "module.{name} = lambda *a, **k: (print('now', flush=True), time.sleep(600))"
     )
-    out, patches = tmp_path / "out", (material / "vehicles", material / "non-vehicles")
+    out, patches = tmp_path / "out", patches_of(material)
     runs = {
         ("video", "process_video"): ["video", long, "-o", out / "x.mp4", "--tracks", out / "x.csv"],
         ("cli.demo", "draw_clip"): ["demo", "-o", tmp_path / "demo" / "deep"],
-        ("training", "train_and_evaluate"): [
-            "train", "--vehicles", patches[0], "--non-vehicles", patches[1], "-o", out / "x.safetensors",
-        ],
-    }  # fmt: skip
+        ("training", "train_and_evaluate"): ["train", *patches, "-o", out / "x.safetensors"],
+    }
     out.mkdir()
     processes = [
         start_changed(slow.format(module=module, name=name), *words) for (module, name), words in runs.items()
@@ -127,12 +124,6 @@ def test_an_interrupted_command_leaves_no_file(monkeypatch, picture, tmp_path):
     monkeypatch.setattr(detector.Detector, "detect", failing(KeyboardInterrupt()))
     result = run("detect", picture, "-o", tmp_path / "a" / "b", "--boxes", tmp_path / "boxes.csv")
     assert (result.exit_code, result.stdout, result.stderr) == (130, "", "interrupted\n")
-    assert contents(tmp_path) == []
-
-
-def test_a_full_disk_is_one_line(monkeypatch, picture, tmp_path):
-    monkeypatch.setattr(Path, "replace", failing(OSError(errno.ENOSPC, "No space left on device")))
-    assert "No space left" in refuse("detect", picture, "--boxes", tmp_path / "boxes.csv")
     assert contents(tmp_path) == []
 
 
@@ -189,12 +180,11 @@ def test_read_only_folders_are_refused(monkeypatch, material, clip, picture, tmp
         ["video", clip, "-o", tmp_path / "out.mp4"],
         ["video", clip, "-o", tmp_path / "out.mp4", "--tracks", tmp_path / "tracks.csv"],
         ["detect", picture, "--boxes", tmp_path / "boxes.csv"],
+        ["detect", picture, "-o", tmp_path / "out"],
         ["evaluate", material / "labels.csv", material / "labels.csv", "--json", tmp_path / "scores.json"],
         ["train", "--vehicles", "v", "--non-vehicles", "n", "-o", tmp_path / "m.safetensors"],
     ):
         assert re.search(read_only, refuse(*words))
-    result = run("detect", picture, "-o", tmp_path / "out")
-    assert (result.exit_code, bool(re.search(read_only, result.stderr))) == (2, True)
     assert contents(tmp_path) == []
 
 
@@ -205,10 +195,7 @@ def test_read_only_folders_are_refused(monkeypatch, material, clip, picture, tmp
         (["--fast"], r"No such option: --fast; see \S+ --help"),
         (["detect", "--fast"], r"No such option: --fast; see \S+ detect --help"),
         (["detect"], r"Missing argument 'IMAGE...'; see \S+ detect --help"),
-        (
-            ["video", "a.mp4", "--jobs", "many"],
-            r"Invalid value for '--jobs': .*(should be|is not) a valid integer; .*",
-        ),
+        (["video", "a.mp4", "--jobs", "many"], r"Invalid value for '--jobs': .* a valid integer; .*"),
         (
             ["video", *(f"CARD/{number}.MP4" for number in range(1000))],
             r"Got unexpected .* \(CARD/1.MP4 [^;]{10,120} \.\.\.\); SOURCE is one argument: for several "

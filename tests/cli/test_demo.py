@@ -1,6 +1,8 @@
 import re
 from dataclasses import replace
 
+import pytest
+
 from tests.cli.commands import contents, refuse, succeed
 from vehicle_detection.cli.demo import FILES, REPORT, SHEET, scored_truth
 from vehicle_detection.images import read_image
@@ -8,28 +10,24 @@ from vehicle_detection.scenes import render_drive
 from vehicle_detection.video import probe_video
 
 
-def test_demo_draws_annotates_and_scores(tmp_path):
-    out = succeed("demo", "-o", tmp_path / "shown", "--frames", 5, "--seed", 4)
+@pytest.mark.parametrize("report", [False, True])
+def test_demo_draws_annotates_and_scores(tmp_path, report):
+    folder, files = tmp_path / "shown", [*FILES, *[REPORT] * report]
+    out = succeed("demo", "-o", folder, "--frames", 5, "--seed", 4, *["--report"] * report)
     assert out.startswith("5 rendered frames of 1280x720")
     for name in ("F1", "mean IoU", "MOTA", "identity switches"):
         assert re.search(rf"^  {name} +(-?\d\S*|nan)\s*$", out, re.MULTILINE), out
     assert re.search(r"speed +\d+\.\d frames/s", out)
-    assert contents(tmp_path / "shown") == sorted(FILES)
-    for name in ("clip.mp4", "annotated.mp4"):
-        info = probe_video(tmp_path / "shown" / name)
-        assert (info.shape, info.frames, float(info.fps)) == ((720, 1280, 3), 5, 25.0)
-    assert read_image(tmp_path / "shown" / "contact_sheet.png").shape == (SHEET[0] * 360, SHEET[1] * 640, 3)
-    words = [tmp_path / "shown" / "tracks.csv", tmp_path / "shown" / "labels.csv"]
-    assert "Detections in" in succeed("evaluate", *words)
-
-
-def test_demo_writes_a_report(tmp_path):
-    folder = tmp_path / "shown"
-    out = succeed("demo", "-o", folder, "--frames", 3, "--report")
-    assert contents(folder) == sorted([*FILES, REPORT])
-    assert out.splitlines()[-1] == f"wrote {', '.join(FILES)}, {REPORT} in {folder}"
-    assert "data:video/mp4;base64," in (folder / REPORT).read_text(encoding="utf-8")
     assert re.search(r"boxes +\d+ on a vehicle, \d+ missed, \d+ false", out)
+    assert out.splitlines()[-1] == f"wrote {', '.join(files)} in {folder}"
+    assert contents(folder) == sorted(files)
+    for name in ("clip.mp4", "annotated.mp4"):
+        info = probe_video(folder / name)
+        assert (info.shape, info.frames, float(info.fps)) == ((720, 1280, 3), 5, 25.0)
+    assert read_image(folder / "contact_sheet.png").shape == (SHEET[0] * 360, SHEET[1] * 640, 3)
+    assert "Detections in" in succeed("evaluate", folder / "tracks.csv", folder / "labels.csv")
+    if report:
+        assert "data:video/mp4;base64," in (folder / REPORT).read_text(encoding="utf-8")
 
 
 def test_demo_scores_oncoming_vehicles():

@@ -17,6 +17,12 @@ from vehicle_detection.svm import load_classifier
 from vehicle_detection.video import read_frames
 
 
+def road(*places, **options):
+    """Render vehicles by their distances and lateral positions in meters."""
+    cars = [SceneVehicle(distance_m=distance, lateral_m=lateral) for distance, lateral in places]
+    return render_scene(vehicles=cars, lane=1, **options)
+
+
 def test_detect_writes_annotated_images_and_boxes(monkeypatch, picture, tmp_path):
     found = [
         Detections([[10, 20, 60.4, 70], [100, 50, 180, 120]], [1.5, 0.25], [0.82, 0.564]),
@@ -59,11 +65,7 @@ def test_detect_draws_scores_and_lines_as_asked(monkeypatch, picture, tmp_path):
 
 
 def test_detect_keeps_boxes_of_a_minimum_confidence(tmp_path):
-    cars = [
-        SceneVehicle(distance_m=distance, lateral_m=lateral) for distance, lateral in ((14, 0), (34, 3.6))
-    ]
-    scene = render_scene(shape=(360, 640), vehicles=cars, lane=1, random_state=3)
-    write_image(tmp_path / "road.png", scene.image)
+    write_image(tmp_path / "road.png", road((14, 0), (34, 3.6), shape=(360, 640), random_state=3).image)
     counts = {}
     for conf in (0.1, 0.999):
         succeed("detect", tmp_path / "road.png", "--conf", conf, "--boxes", tmp_path / "boxes.csv")
@@ -74,11 +76,7 @@ def test_detect_keeps_boxes_of_a_minimum_confidence(tmp_path):
 
 
 def test_a_wrong_horizon_gives_a_warning(tmp_path):
-    cars = [
-        SceneVehicle(distance_m=distance, lateral_m=lateral)
-        for distance, lateral in ((15, 0), (19, 3.6), (28, -3.6), (38, 0.3), (42, 3.4))
-    ]
-    scene = render_scene(vehicles=cars, lane=1, random_state=3)
+    scene = road((15, 0), (19, 3.6), (28, -3.6), (38, 0.3), (42, 3.4), random_state=3)
     write_image(tmp_path / "road.png", scene.image)
     assert ": 0 vehicles" not in succeed("detect", tmp_path / "road.png", "--horizon", 0.95)
     highway = "--model", "highway"  # the network searches all rows
@@ -97,15 +95,7 @@ def test_a_wrong_horizon_gives_a_warning(tmp_path):
     assert run("detect", tmp_path / "empty.png", "--horizon", 0.95).stderr == ""
 
 
-def test_an_image_given_twice_is_searched_once(picture, tmp_path):
-    once = succeed("detect", picture, "--boxes", tmp_path / "once.csv")
-    assert once.count("vehicle") == succeed("detect", picture, picture, "--boxes", tmp_path / "b.csv").count(
-        "vehicle"
-    )
-    assert (tmp_path / "b.csv").read_text() == (tmp_path / "once.csv").read_text()
-
-
-def test_patterns_of_images_are_expanded(picture, tmp_path):
+def test_patterns_of_images_are_expanded_and_each_image_searched_once(picture, tmp_path):
     for name in ("a.png", "b.png", "c[1].png"):
         shutil.copy(picture, tmp_path / name)
     (tmp_path / "d.png").mkdir()
@@ -202,8 +192,7 @@ def test_no_image_that_can_be_decoded_prevents_the_table(material, tmp_path):
 
 def test_detect_explains_each_box(tmp_path):
     image, why = tmp_path / "road.png", tmp_path / "why"
-    scene = render_scene(shape=(360, 640), vehicles=[SceneVehicle(distance_m=14.0)], lane=1, random_state=1)
-    write_image(image, scene.image)
+    write_image(image, road((14, 0), shape=(360, 640), random_state=1).image)
     out = succeed("detect", image, "--why", why)
     line = r"^  1: score (\S+): margin \1 = \S+ cells \S+ rest$"
     assert re.search(line, out, re.MULTILINE)
@@ -213,17 +202,17 @@ def test_detect_explains_each_box(tmp_path):
 
 
 def test_detect_and_video_blur_vehicles(tmp_path):
-    image, road = tmp_path / "road.png", tmp_path / "road.mp4"
+    image, clip = tmp_path / "road.png", tmp_path / "road.mp4"
     car = SceneVehicle(distance_m=14.0, kind="sedan", color="white")
     scene = render_scene(shape=(360, 640), vehicles=[car], lane=1, random_state=1)
     write_image(image, scene.image)
-    write_clip(road, [scene.image] * 3)
+    write_clip(clip, [scene.image] * 3)
     x1, y1, x2, y2 = scene.boxes[0].tolist()
     inside = slice((3 * y1 + y2) // 4, (y1 + 3 * y2) // 4), slice((3 * x1 + x2) // 4, (x1 + 3 * x2) // 4)
     contrasts = []
     for folder, words in (("sharp", []), ("blurred", ["--blur", "vehicles"])):
         succeed("detect", image, "-o", tmp_path / folder, *words)
-        succeed("video", road, "-o", tmp_path / f"{folder}.mp4", "--preset", "ultrafast", *words)
+        succeed("video", clip, "-o", tmp_path / f"{folder}.mp4", "--preset", "ultrafast", *words)
         with read_frames(tmp_path / f"{folder}.mp4") as frames:
             pictures = read_image(tmp_path / folder / "road.png"), next(frames)[2]
         contrasts.append(

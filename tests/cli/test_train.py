@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from tests.cli.commands import contents, patches_of, refuse, refuse_each, succeed
-from vehicle_detection import datasets, training
 from vehicle_detection.detector import load_model
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import write_image
@@ -93,7 +92,7 @@ def test_defaults_are_those_of_the_library(monkeypatch, material, tmp_path):
         given.update(options)
         raise InvalidInputError("enough")
 
-    monkeypatch.setattr(training, "train_and_evaluate", note)
+    monkeypatch.setattr("vehicle_detection.train_and_evaluate", note)
     refuse("train", *patches_of(material), "-o", tmp_path / "m.safetensors")
     assert given["params"] == load_classifier().params
     assert given["split"] == "random"
@@ -103,22 +102,18 @@ def test_defaults_are_those_of_the_library(monkeypatch, material, tmp_path):
 
 
 def test_fetch_prints_the_paths_of_the_patches(monkeypatch, tmp_path):
+    names = "vehicles.zip", "non-vehicles.zip"
     monkeypatch.setattr(
-        datasets,
-        "fetch_patches",
-        lambda output, progress: (output / "vehicles.zip", output / "non-vehicles.zip"),
+        "vehicle_detection.fetch_patches", lambda output, progress: [output / name for name in names]
     )
-    assert succeed("fetch", "-o", tmp_path).splitlines() == [
-        str(tmp_path / "vehicles.zip"),
-        str(tmp_path / "non-vehicles.zip"),
-    ]
+    assert succeed("fetch", "-o", tmp_path).splitlines() == [str(tmp_path / name) for name in names]
 
 
 def test_a_failed_fetch_leaves_no_folder(monkeypatch, tmp_path):
     def fail(output, progress):
         raise DatasetError("the server cannot\nbe reached")
 
-    monkeypatch.setattr(datasets, "fetch_patches", fail)
+    monkeypatch.setattr("vehicle_detection.fetch_patches", fail)
     assert refuse("fetch", "-o", tmp_path / "new") == "error: the server cannot be reached\n"
     assert contents(tmp_path) == []
 

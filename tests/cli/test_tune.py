@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from tests.cli import commands
-from tests.helpers import rendered_patches
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.scenes import render_scene, write_labels
 from vehicle_detection.training import read_results, trials
@@ -21,11 +20,7 @@ def run(*words):
 def material(tmp_path_factory):
     """Return a folder with patches of both classes, and a frame with its labels."""
     folder = tmp_path_factory.mktemp("material")
-    patches, labels = rendered_patches(80)
-    for row, (patch, label) in enumerate(zip(patches, labels)):
-        home = folder / ("vehicles" if label else "non-vehicles") / "drawn"
-        home.mkdir(parents=True, exist_ok=True)
-        write_image(home / f"{row}.png", patch)
+    commands.write_patches(folder, 80)
     (folder / "road").mkdir()
     scene = render_scene(shape=(360, 640), vehicles=2, random_state=1)
     write_image(folder / "road" / "1.png", scene.image)
@@ -35,7 +30,7 @@ def material(tmp_path_factory):
 
 @pytest.fixture
 def patches(material):
-    return ("--vehicles", material / "vehicles", "--non-vehicles", material / "non-vehicles")
+    return commands.patches_of(material)
 
 
 def test_a_grid_becomes_a_table_and_a_figure(patches, tmp_path, monkeypatch):
@@ -108,9 +103,9 @@ def test_tune_refuses_bad_input(patches, material, tmp_path, monkeypatch):
         "{patches} -o t.csv --grid orient": "--grid must look like 'orient=8,9",
         "{patches} {grid} -o t.csv --halving --finalists 0": "--finalists must be an integer at least 1",
         "{patches} {grid} -o t.csv --split half": "--split must be one of 'sequences'",
-        "{patches} {grid} -o t.xls": "--output must end in .csv, .jsonl, .parquet",
+        "{patches} {grid} -o t.xls": "--output must end in .csv or .jsonl or .parquet",
         "{patches} {grid} -o none/t.csv": "--output needs an existing folder",
-        "{patches} {grid} -o t.csv --plot p.jpg": "--plot must end in .png, .svg",
+        "{patches} {grid} -o t.csv --plot p.jpg": "--plot must end in .png or .svg",
         "{patches} {grid} -o t.csv --plot none/p.png": "--plot needs an existing folder",
         "{patches} {grid} -o t.csv --frames {material}/road": "--frames and --labels .*; give both",
         "{patches} {grid} -o t.csv --horizon 0.5": "--horizon needs --frames",
@@ -125,11 +120,9 @@ def test_tune_refuses_bad_input(patches, material, tmp_path, monkeypatch):
     assert Path("a.csv").read_text() == "a,b\n1,2\n"
 
 
-def test_a_grid_that_cannot_be_trained_is_an_error(material, tmp_path):
-    words = ("--vehicles", material / "vehicles", "--non-vehicles", material / "non-vehicles")
-    words += ("--grid", f"{SMALL} C=-1", "-o", tmp_path / "t.csv")
+def test_a_grid_that_cannot_be_trained_is_an_error(patches, tmp_path):
     for _ in range(2):
-        result = run(*words)
+        result = run(*patches, "--grid", f"{SMALL} C=-1", "-o", tmp_path / "t.csv")
         assert result.exit_code == 2
         assert "failed: C must be" in result.stdout
         message = "error: --grid has no configuration that can be trained, for the reasons above"

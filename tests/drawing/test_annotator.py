@@ -14,7 +14,6 @@ from vehicle_detection.annotator import (
     Annotator,
     BirdsEyePanel,
     DrawParams,
-    Trails,
     draw_diagnostics,
     draw_tracks,
     road_position,
@@ -40,15 +39,11 @@ SIZES = [(360, 480), (720, 1280), (1920, 1080), (2160, 3840)]
 
 
 class TestTracks:
-    def test_draws_on_a_copy(self):
+    def test_box_and_label_are_drawn_on_a_copy_in_the_tracks_color(self):
         image = blank()
         image.setflags(write=False)
-        drawn = draw_tracks(image, [track()])
-        np.testing.assert_array_equal(image, blank())
+        drawn = draw_tracks(image, [track(id=3)])
         assert drawn.flags.writeable
-
-    def test_box_and_label_have_the_tracks_color(self):
-        drawn = draw_tracks(blank(), [track(id=3)])
         assert tuple(drawn[489, 650].tolist()) == TRACK_COLORS[2]
         assert tuple(drawn[399, 601].tolist()) == TRACK_COLORS[2]
 
@@ -60,26 +55,14 @@ class TestTracks:
 
     def test_color_blind_viewers_can_tell_the_colors_apart(self):
         """Machado et al. (2009), full protanopia, deuteranopia and tritanopia."""
-        simulations = [
-            [
-                [0.152286, 1.052583, -0.204868],
-                [0.114503, 0.786281, 0.099216],
-                [-0.003882, -0.048116, 1.051998],
-            ],
-            [
-                [0.367322, 0.860646, -0.227968],
-                [0.280085, 0.672501, 0.047413],
-                [-0.011820, 0.042940, 0.968881],
-            ],
-            [
-                [1.255528, -0.076749, -0.178779],
-                [-0.078411, 0.930809, 0.147602],
-                [0.004733, 0.691367, 0.303900],
-            ],
-        ]
+        simulations = np.array([
+            0.152286, 1.052583, -0.204868, 0.114503, 0.786281, 0.099216, -0.003882, -0.048116, 1.051998,
+            0.367322, 0.860646, -0.227968, 0.280085, 0.672501, 0.047413, -0.011820, 0.042940, 0.968881,
+            1.255528, -0.076749, -0.178779, -0.078411, 0.930809, 0.147602, 0.004733, 0.691367, 0.303900,
+        ])  # fmt: skip
         linear = (np.array(TRACK_COLORS) / 255) ** 2.2
-        for matrix in simulations:
-            simulated = np.clip(linear @ np.array(matrix).T, 0, 1) ** (1 / 2.2) * 255
+        for matrix in simulations.reshape(3, 3, 3):
+            simulated = np.clip(linear @ matrix.T, 0, 1) ** (1 / 2.2) * 255
             nearest = min(np.linalg.norm(a - b) for a, b in itertools.combinations(simulated, 2))
             assert nearest > 25
 
@@ -100,11 +83,10 @@ class TestTracks:
             assert line[-1]
             assert np.diff(line.astype(int)).clip(0).sum() >= 4
 
-    @pytest.mark.parametrize("side", [1, 2, 3, 5, 9])
-    def test_a_tiny_coasting_track_is_visible(self, side):
-        image, box = blank(), (600, 400, 600 + side, 400 + side)
-        drawn = draw_tracks(image, [track(box, state="coasting")], labels=())
-        assert changed_box(drawn, image) == list(box)
+        for side in (1, 2, 3, 5, 9):
+            box = (600, 400, 600 + side, 400 + side)
+            tiny = draw_tracks(image, [track(box, state="coasting")], labels=())
+            assert changed_box(tiny, image) == list(box)
 
     @pytest.mark.parametrize(("height", "width"), SIZES)
     def test_the_label_grows_with_the_image_and_lies_above_its_box(self, height, width):
@@ -121,11 +103,8 @@ class TestTracks:
     @pytest.mark.parametrize("corner", [(0, 0), (0, 1), (1, 0), (1, 1)])
     def test_labels_stay_inside_the_image(self, height, width, corner):
         side_x, side_y = width // 12, height // 12
-        sizes = []
-        for x, y in (
-            (width // 2, height // 2),
-            (corner[0] * (width - side_x), corner[1] * (height - side_y)),
-        ):
+        sizes, at_corner = [], (corner[0] * (width - side_x), corner[1] * (height - side_y))
+        for x, y in ((width // 2, height // 2), at_corner):
             tracks = [track((x, y, x + side_x, y + side_y))]
             bare = draw_tracks(blank(height, width), tracks, labels=())
             x1, y1, x2, y2 = changed_box(draw_tracks(blank(height, width), tracks), bare)
@@ -135,39 +114,31 @@ class TestTracks:
         assert np.abs(np.subtract(*sizes)).max() <= line
 
     def test_labels_of_neighbors_hide_neither_each_other_nor_a_vehicle(self):
-        image = blank()
+        def labels_of(tracks):
+            return (draw_tracks(blank(), tracks) != draw_tracks(blank(), tracks, labels=())).any(axis=2)
+
         pair = [track((600, 400, 700, 490)), track((610, 402, 712, 495), id=2)]
-        bare = draw_tracks(image, pair, labels=())
-        areas = [
-            int((draw_tracks(image, [one]) != draw_tracks(image, [one], labels=())).any(axis=2).sum())
-            for one in pair
-        ]
-        changed = (draw_tracks(image, pair) != bare).any(axis=2)
-        assert int(changed.sum()) > 0.9 * sum(areas)
+        changed = labels_of(pair)
+        assert changed.sum() > 0.9 * sum(labels_of([one]).sum() for one in pair)
         assert not changed[402:490, 610:700].any()
 
     def test_the_line_width_is_given_or_grows_with_the_image(self):
-        for width in (1, 5):
-            drawn = draw_tracks(blank(), [track()], labels=(), line_width=width)
-            assert int((drawn[450, 600:650] != 90).any(axis=1).sum()) == width
-        widths = [
-            int((draw_tracks(blank(*shape), [track((200, 100, 400, 300))], labels=())[200, 200:300] != 90)
-                .any(axis=1).sum())
-            for shape in SIZES
-        ]  # fmt: skip
+        def width_of(image, **options):
+            drawn = draw_tracks(image, [track((200, 100, 400, 300))], labels=(), **options)
+            return int((drawn[200, 200:300] != 90).any(axis=1).sum())
+
+        assert [width_of(blank(), line_width=width) for width in (1, 5)] == [1, 5]
+        widths = [width_of(blank(*shape)) for shape in SIZES]
         assert widths == sorted(widths)
         assert widths[0] == 2
 
     def test_colors_by_distance_run_from_near_to_far(self):
-        near, middle, far, unknown = (
-            track_color(track(distance_m=distance), "distance") for distance in (3.0, 20.0, 80.0, None)
+        near, middle, between, far, unknown = (
+            track_color(track(distance_m=distance), "distance") for distance in (3.0, 20.0, 27.0, 80.0, None)
         )
-        assert near == TRACK_COLORS[5]
-        assert middle == TRACK_COLORS[0]
-        assert far == TRACK_COLORS[1]
-        assert unknown not in TRACK_COLORS
-        between = track_color(track(distance_m=27.0), "distance")
+        assert (near, middle, far) == (TRACK_COLORS[5], TRACK_COLORS[0], TRACK_COLORS[1])
         assert TRACK_COLORS[0][1] < between[1] < TRACK_COLORS[3][1]
+        assert unknown not in TRACK_COLORS
         drawn = draw_tracks(blank(), [track(distance_m=3.0)], color_by="distance")
         assert tuple(drawn[489, 650].tolist()) == TRACK_COLORS[5]
 
@@ -237,12 +208,6 @@ class TestDrawer:
             first, again = (drawer.draw_tracks(blank(), [track()], time=0.04) for _ in range(2))
             np.testing.assert_array_equal(first, again)
 
-    def test_the_first_frame_is_that_of_draw_tracks(self):
-        tracks = [track(), track((650, 380, 750, 470), id=2, state="coasting")]
-        np.testing.assert_array_equal(
-            Annotator().draw_tracks(blank(), tracks, time=3.0), draw_tracks(blank(), tracks)
-        )
-
     def test_an_earlier_frame_starts_anew(self):
         drawer = Annotator(DrawParams(panel="corner"))
         first = drawer.draw_tracks(blank(), [track()], time=1.0)
@@ -299,23 +264,23 @@ class TestPosition:
         assert position.radial_std_m == pytest.approx(2.0)
         assert 0.05 < position.tangential_std_m < 0.3
 
-    def test_is_unknown_without_a_distance(self):
-        assert road_position(track(distance_m=None, distance_std_m=None), CAMERA, SHAPE) is None
-
-
-def test_trails_cover_a_time_and_drop_lost_tracks():
-    trails = Trails()
-    for step in range(100):
-        result = trails.update(step / 25, {1: (step, 10), 2: None})
-    times = [time for time, _ in result[1]]
-    assert times == sorted(times)
-    assert 3.96 - 1.5 <= times[0] < 3.96 - 1.3
-    assert len(times) <= 20
-    assert not result[2]
-    assert trails.update(4.0, {2: None}).keys() == {2}
-
 
 class TestPanel:
+    def test_trails_cover_a_time_and_drop_lost_tracks(self):
+        """The last 1.5 s, which begin at 41 m; and a track that is found again starts anew."""
+        drawer, scale = Annotator(SIDE, camera=CAMERA), 720 / 86
+        empty = drawer.draw_tracks(blank(), [], time=0.0)
+        for step in range(101):
+            ahead = track(distance_m=10 + 0.5 * step, distance_std_m=0.1, speed_mps=None)
+            drawn = drawer.draw_tracks(blank(), [ahead], time=step / 25)
+        rows, _ = np.nonzero((drawn != empty).any(axis=2)[:, 1280:])
+        assert 41 <= 80 - rows.max() / scale < 44
+        drawer.draw_tracks(blank(), [], time=4.04)
+        again, new = (
+            each.draw_tracks(blank(), [ahead], time=4.08) for each in (drawer, Annotator(SIDE, camera=CAMERA))
+        )
+        np.testing.assert_array_equal(again, new)
+
     @pytest.mark.parametrize(
         "shape", [(720, 1280, 3), (1080, 1919, 3), (1920, 1080, 3), (270, 480, 3), (4, 5, 3)]
     )
@@ -329,12 +294,14 @@ class TestPanel:
         np.testing.assert_array_equal(drawn[:, : shape[1]], plain)
         assert Annotator().output_shape(shape) == shape
 
-    def test_in_the_corner(self):
-        drawn = Annotator(DrawParams(panel="corner", labels=()), camera=CAMERA).draw_tracks(blank(), [])
-        left, top, right, bottom = changed_box(drawn, blank())
-        assert (top, right) == (0, 1280)
-        assert (bottom, right - left) == BirdsEyePanel.corner_size(SHAPE)
-        assert bottom < 0.45 * 720
+    def test_in_the_corner_of_frames_of_any_size(self):
+        drawer = Annotator(DrawParams(panel="corner", labels=()), camera=CAMERA)
+        for shape in (SHAPE, (360, 640, 3)):
+            image = blank(*shape[:2])
+            left, top, right, bottom = changed_box(drawer.draw_tracks(image, []), image)
+            assert (top, right) == (0, shape[1])
+            assert (bottom, right - left) == BirdsEyePanel.corner_size(shape)
+            assert bottom < 0.45 * shape[0]
 
     def test_distances_in_feet(self):
         """Lines at 75, 150 and 225 ft instead of 20, 40 and 60 m."""
@@ -398,12 +365,6 @@ class TestPanel:
             drawn = Annotator(SIDE, camera=CAMERA).draw_tracks(blank(), [ahead])
             sums.append((drawn[:, 1280:] == TRACK_COLORS[0]).all(axis=2).sum())
         assert sums[1] < 0.6 * sums[0]
-
-    def test_another_frame_size_gets_another_panel(self):
-        drawer = Annotator(DrawParams(panel="corner"))
-        drawer.draw_tracks(blank(), [track()], time=0.0)
-        small = drawer.draw_tracks(blank(360, 640), [], time=1.0)
-        assert changed_box(small, blank(360, 640))[3] == BirdsEyePanel.corner_size((360, 640))[0]
 
 
 @pytest.mark.parametrize(

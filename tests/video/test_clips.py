@@ -17,7 +17,6 @@ from moviepy import (
 
 from tests.video.clips import write_clip
 from vehicle_detection.annotator import Annotator, DrawParams
-from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.function_model import detector_from
 from vehicle_detection.scenes import render_drive
@@ -78,17 +77,11 @@ def expected():
 def test_frames_are_processed_once_with_their_times(expected):
     recorder = Recorder(clip_of())
     assert recorder.times == [0]  # moviepy reads the first frame to know its size
-    assert_same(pictures(recorder.clip), expected)
-    assert recorder.times == [step / 25 for step in range(20)]
-    assert [result.index for result in recorder.results] == list(range(20))
-    assert [track.id for track in recorder.results[-1].shown] == [1]
-
-
-def test_a_second_rendering_equals_the_first(expected):
-    recorder = Recorder(clip_of())
-    for _ in range(2):
+    for _ in range(2):  # a second rendering equals the first
         assert_same(pictures(recorder.clip), expected)
+        assert [track.id for track in recorder.results[-1].shown] == [1]
     assert recorder.times == 2 * [step / 25 for step in range(20)]
+    assert [result.index for result in recorder.results] == 2 * list(range(20))
 
 
 def test_a_frame_that_is_read_twice_is_processed_once(expected):
@@ -147,7 +140,7 @@ def test_a_video_file_is_annotated(tmp_path):
         assert recorder.times == [step / 25 for step in range(10)]
 
 
-def test_parts_before_and_after(expected):
+def test_a_part_of_an_annotated_clip(expected):
     recorder = Recorder(clip_of())
     part = recorder.clip.subclipped(0.2, 0.6)
     recorder.results.clear()
@@ -220,32 +213,21 @@ def test_clips_without_a_frame_rate():
     assert [track.id for track in still.results[-1].shown] == [1]
 
 
-def test_diagnostics_are_another_picture():
-    detector = detector_from(find_red, annotator=Annotator(diagnostics=True))
-    annotated = annotate_clip(clip_of(3), detector)
-    assert pictures(annotated)[0].shape[:2] == annotated.size[::-1]
-
-
-def speeds_of(results):
-    return [track.speed_mps for result in results for track in result.shown if track.speed_mps is not None]
-
-
 def test_speeds_are_right_for_every_frame_rate():
-    medians = {}
     for fps in (25, 50):
         drive = render_drive(frames=2 * fps, fps=fps, shape=(360, 640), random_state=3)
-        truth = [row for rows in drive.truth for row in rows if not row.ignore]
-        boxes = [np.array([row.box for row in rows if not row.ignore]).reshape(-1, 4) for rows in drive.truth]
-        found = iter(boxes)
+        truth = [[row for row in rows if not row.ignore] for rows in drive.truth]
+        found = iter([np.array([row.box for row in rows]).reshape(-1, 4) for rows in truth])
         detector = detector_from(
             lambda image, found=found: ((box := next(found)), [0.95] * len(box)), camera=drive[0].camera
         )
         clip = ImageSequenceClip([np.zeros((360, 640, 3), np.uint8)] * len(drive), fps=fps)
         results = []
         pictures(annotate_clip(clip, detector, on_result=results.append))
-        medians[fps] = np.median(speeds_of(results[-fps // 2 :])), np.median([row.speed_mps for row in truth])
-    for estimate, true in medians.values():
+        shown = [track for result in results[-fps // 2 :] for track in result.shown]
+        estimate = np.median([track.speed_mps for track in shown if track.speed_mps is not None])
         # A wrong frame rate would double or halve it.
+        true = np.median([row.speed_mps for rows in truth for row in rows])
         assert estimate == pytest.approx(true, rel=0.15, abs=0.1)
 
 
@@ -274,18 +256,11 @@ def test_what_is_no_clip_is_refused(clip):
         annotate_clip(clip_of(1), detector_from(find_red), on_result=5)
 
 
-def test_a_shipped_model_annotates_a_clip():
-    drive = render_drive(frames=8, shape=(360, 640))
-    clip = ImageSequenceClip([scene.image for scene in drive], fps=drive.fps)
-    with VehicleDetector(jobs=1) as detector:
-        assert len(pictures(annotate_clip(clip, detector))) == 8
-
-
-def test_a_view_beside_the_frame_widens_the_clip():
-    detector = detector_from(find_red, annotator=Annotator(DrawParams(panel="side")))
-    clip = annotate_clip(clip_of(3), detector)
-    height, width, _ = detector.annotator.output_shape((*SHAPE, 3))
-    assert width > SHAPE[1]
+@pytest.mark.parametrize("annotator", [Annotator(DrawParams(panel="side")), Annotator(diagnostics=True)])
+def test_the_size_of_the_clip_is_that_of_its_pictures(annotator):
+    clip = annotate_clip(clip_of(3), detector_from(find_red, annotator=annotator))
+    height, width, _ = annotator.output_shape((*SHAPE, 3))
+    assert (width > SHAPE[1]) == (not annotator.diagnostics)
     assert tuple(clip.size) == (width, height)
     assert {frame.shape for frame in pictures(clip)} == {(height, width, 3)}
 

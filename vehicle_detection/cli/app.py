@@ -21,7 +21,6 @@ from vehicle_detection.cli.batch import batch
 from vehicle_detection.cli.demo import demo
 from vehicle_detection.cli.detect import detect
 from vehicle_detection.cli.evaluate import evaluate
-from vehicle_detection.cli.fetch import fetch
 from vehicle_detection.cli.info import info
 from vehicle_detection.cli.output import (
     exit_if_abandoned,
@@ -31,7 +30,7 @@ from vehicle_detection.cli.output import (
     replace_unprintable,
 )
 from vehicle_detection.cli.signals import raise_on_signals
-from vehicle_detection.cli.train import train
+from vehicle_detection.cli.train import fetch, train
 from vehicle_detection.cli.train_frames import train_frames
 from vehicle_detection.cli.tune import tune
 from vehicle_detection.cli.video import video
@@ -39,7 +38,6 @@ from vehicle_detection.errors import DatasetError, InvalidInputError, VehicleDet
 
 BAD_INPUT, INTERRUPTED = 2, 130  # exit codes
 _MAX_LISTED = 120  # characters of a message that lists surplus arguments
-
 
 # Raised for an unknown command or option, or a value of another type; typer has no public name for it.
 _UsageError: type[Any] = typer.BadParameter.__bases__[0]

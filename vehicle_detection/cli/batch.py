@@ -13,16 +13,13 @@ from typing import Any
 import typer
 from typer import Argument
 
+import vehicle_detection as vd
 from vehicle_detection.cli import options as shared
 from vehicle_detection.cli.options import flag, option, parse_classes, takes
-from vehicle_detection.cli.output import (
-    UNKNOWN_LENS,
-    option_names,
-    output_folder,
-    print_error,
-    print_line,
-)
+from vehicle_detection.cli.output import UNKNOWN_LENS, option_names, output_folder, print_error, print_line
 from vehicle_detection.errors import InvalidInputError
+
+_DETECTOR_OPTIONS = "conf", "horizon", "camera", "fov", "camera_height", "every", "blur"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,46 +65,30 @@ class BatchOptions:
 
     def detector_options(self) -> dict[str, Any]:
         """Options of the detector that are given."""
-        options = {
-            "classes": parse_classes(self.classes),
-            "device": None if self.device == "cpu" else self.device,
-            "conf": self.conf,
-            "horizon": self.horizon,
-            "camera": self.camera,
-            "fov": self.fov,
-            "camera_height": self.camera_height,
-            "every": self.every,
-            "blur": self.blur,
-        }
+        options: dict[str, Any] = {"classes": parse_classes(self.classes)}
+        options |= {name: getattr(self, name) for name in _DETECTOR_OPTIONS}
+        if self.device != "cpu":
+            options["device"] = self.device
         return {name: value for name, value in options.items() if value is not None}
 
 
-@option_names(
-    out="--output",
-    retry_failed="--retry-failed",
-    dry_run="--dry-run",
-    height_m="--camera-height",
-)
+@option_names(out="--output", retry_failed="--retry-failed", dry_run="--dry-run", height_m="--camera-height")
 @takes(BatchOptions)
 def batch(options: BatchOptions) -> None:
     """Track the vehicles of many videos in parallel; run again to do what is missing or changed."""
-    output, summary, quiet = options.output, options.summary, options.quiet
-    if summary is not None:
-        from vehicle_detection._common import check_suffix
+    from vehicle_detection._common import check_suffix, hide_credentials
 
+    output, summary = options.output, options.summary
+    if summary is not None:
         check_suffix(summary, "--summary", (".csv",))
         if options.dry_run:
             raise InvalidInputError("--dry-run has no results for --summary; omit one of them")
     if options.status:
-        from vehicle_detection.drive import batch_status
-
-        print_line(str(batch_status(output)))
+        print_line(str(vd.drive.batch_status(output)))
         _write_summary(output, summary)
         return
     if not options.sources:
         raise InvalidInputError("SOURCES... must name at least one video, folder, pattern or URL")
-    from vehicle_detection._common import hide_credentials
-
     done = _run(options, options.sources)
     if options.dry_run:
         for trip in done.planned or ():
@@ -115,7 +96,7 @@ def batch(options: BatchOptions) -> None:
         print_line(str(done))
         return
     _write_summary(output, summary)
-    if not quiet:
+    if not options.quiet:
         if done.done and options.camera is None and options.fov is None:
             print_error(UNKNOWN_LENS)
         print_line(str(done))
@@ -127,18 +108,17 @@ def batch(options: BatchOptions) -> None:
 def _run(options: BatchOptions, sources: list[str]) -> Any:
     """Process the trips of the sources, on a Dask cluster if one is named."""
     from vehicle_detection._common import is_url, local_path
-    from vehicle_detection.drive import open_dask, run_batch
 
     with contextlib.ExitStack() as stack:
         executor = None
         if options.dask is not None and not options.dry_run:
-            executor, dashboard = stack.enter_context(open_dask(options.dask, options.jobs))
+            executor, dashboard = stack.enter_context(vd.drive.open_dask(options.dask, options.jobs))
             if not options.quiet:
                 print_line(f"dashboard {dashboard}")
         folder = local_path(options.output)
         if folder and not options.dry_run and not is_url(folder):
             stack.enter_context(output_folder(Path(folder), "--output"))
-        return run_batch(
+        return vd.run_batch(
             sources,
             options.output,
             executor,
@@ -160,13 +140,12 @@ def _run(options: BatchOptions, sources: list[str]) -> Any:
 def _print_record(record: Mapping[str, Any], *, done: bool) -> None:
     """Warn of a trip without results; with `done` also print others, for logs, which show no progress bar."""
     from vehicle_detection._common import encodable, hide_credentials, pluralize
-    from vehicle_detection.drive import with_source
 
     source = record["sources"][0]["uri"]
     # A log that cannot be written does not end the batch.
     with contextlib.suppress(OSError, ValueError):
         if record["status"] != "done":
-            print_error(f"warning: {with_source(source, record['message'])}")
+            print_error(f"warning: {vd.drive.with_source(source, record['message'])}")
         elif done:
             name = encodable(hide_credentials(source))
             print_error(f"done: {name}, {pluralize(record['frames'], 'frame')}")
@@ -184,11 +163,9 @@ def _print_trip(trip: Mapping[str, Any]) -> None:
 
 def _write_summary(output: str, summary: Path | None) -> None:
     """Write the table of all trips of a batch."""
-    if summary is None:
-        return
-    from vehicle_detection._common import atomic_write
-    from vehicle_detection.drive import batch_summary
+    if summary is not None:
+        from vehicle_detection._common import atomic_write
 
-    table = batch_summary(output)
-    with atomic_write(summary, "--summary") as part:
-        table.to_csv(part, index=False)
+        table = vd.drive.batch_summary(output)
+        with atomic_write(summary, "--summary") as part:
+            table.to_csv(part, index=False)

@@ -8,29 +8,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import vehicle_detection as vd
 from vehicle_detection.cli.options import flag, option
 from vehicle_detection.cli.output import option_names, output_folder, print_facts, print_line
 from vehicle_detection.errors import OutputError, VehicleDetectionError, VideoError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from vehicle_detection.detector import VehicleDetector
-    from vehicle_detection.evaluation import TrackScores
     from vehicle_detection.scenes import Drive, VehicleTruth
     from vehicle_detection.video import VideoReport
 
+# Files that the demo writes, the report only if it is asked for.
 FILES = ("clip.mp4", "annotated.mp4", "tracks.csv", "labels.csv", "contact_sheet.png")
-"""Files that the demo writes: rendered clip, annotated clip, tracks, ground truth, some annotated frames."""
-
 REPORT = "report.html"
-"""File that the demo writes too if a report is asked for."""
-
-SHEET = (2, 3)
-"""Rows and columns of the contact sheet."""
-
-_TILE = (640, 360)
+# Rows and columns of the contact sheet, and size of each frame in it.
+SHEET, _TILE = (2, 3), (640, 360)
 
 
 @option_names(random_state="--seed")
@@ -45,12 +36,11 @@ def demo(
     Oncoming vehicles are scored too; boxes on vehicles that are under 40 pixels wide or largely hidden are
     neither right nor wrong.
     """
-    from vehicle_detection.camera import Camera
-    from vehicle_detection.detector import VehicleDetector
-
-    # The field of view of the rendering camera.
-    with output_folder(output, "--output"), VehicleDetector(camera=Camera.dashcam(fov=58)) as detector:
-        done, scores = _run(output, detector, frames=frames, random_state=seed, report=report)
+    files = (*FILES, REPORT) if report else FILES
+    camera = vd.Camera.dashcam(fov=58)  # that of the rendering camera
+    with output_folder(output, "--output"), vd.VehicleDetector(camera=camera) as detector:
+        drive = vd.render_drive(frames=frames, random_state=seed)
+        done, scores = _run(output, detector, drive, files)
     print_facts(
         f"{scores.frames} rendered frames of 1280x720, {scores.vehicles} vehicles, {scores.tracks} tracks",
         {
@@ -62,40 +52,34 @@ def demo(
             "speed": f"{done.frames_per_second:.1f} frames/s",
         },
     )
-    print_line(f"wrote {', '.join((*FILES, REPORT) if report else FILES)} in {output}")
+    print_line(f"wrote {', '.join(files)} in {output}")
 
 
 def _run(
-    folder: Path, detector: VehicleDetector, *, frames: int, random_state: int, report: bool
-) -> tuple[VideoReport, TrackScores]:
+    folder: Path, detector: vd.VehicleDetector, drive: Drive, files: Sequence[str]
+) -> tuple[VideoReport, vd.evaluation.TrackScores]:
     """Draw a drive, annotate and score it, oncoming vehicles too; an error leaves no file in the folder."""
     import numpy as np
 
     from vehicle_detection._common import temporary_folder
-    from vehicle_detection.drive import ReportWriter
-    from vehicle_detection.evaluation import evaluate_tracks
-    from vehicle_detection.formats import open_tracks, read_labels
-    from vehicle_detection.images import write_image
-    from vehicle_detection.scenes import render_drive
-    from vehicle_detection.video import process_video
 
-    drive = render_drive(frames=frames, random_state=random_state)
     with temporary_folder(folder, "demo") as temporary, _named_in(folder, temporary):
         clip, annotated, tracks, labels, sheet = (temporary / name for name in FILES)
-        page = ReportWriter(temporary / REPORT, video=annotated, source=clip, detector=detector)
+        page = vd.ReportWriter(temporary / REPORT, video=annotated, source=clip, detector=detector)
         draw_clip(drive, clip, labels, progress=True)
         # Compile the kernels now, so that the reported speed does not include it.
         detector.detect(np.zeros((*drive.shape, 3), np.uint8))
-        with open_tracks(tracks) as write:
+        with vd.open_tracks(tracks) as write:
             writers: list[Callable[[Any], object]] = [write, page]
-            done = process_video(
+            done = vd.process_video(
                 clip, annotated, detector, on_result=lambda result: [each(result) for each in writers]
             )
-        scores = evaluate_tracks(read_labels(tracks), read_labels(labels), frames=range(len(drive)))
-        write_image(sheet, contact_sheet(annotated))
-        if report:
+        found, true = vd.read_labels(tracks), vd.read_labels(labels)
+        scores = vd.evaluate_tracks(found, true, frames=range(len(drive)))
+        vd.write_image(sheet, contact_sheet(annotated))
+        if REPORT in files:
             page.finish(done)
-        for name in (*FILES, REPORT) if report else FILES:
+        for name in files:
             (temporary / name).replace(folder / name)
     return done, scores
 
@@ -144,15 +128,13 @@ def scored_truth(rows: Sequence[VehicleTruth]) -> list[VehicleTruth]:
     return [replace(row, ignore=int(row.hard_to_see)) for row in rows]
 
 
-def contact_sheet(video: Path) -> NDArray[np.uint8]:
+def contact_sheet(video: Path) -> Any:
     """Arrange evenly spaced frames of a video in one ``(H, W, 3)`` uint8 image."""
     import cv2
     import numpy as np
 
-    from vehicle_detection.video import read_frames
-
     rows, columns = SHEET
-    with read_frames(video) as reader:
+    with vd.read_frames(video) as reader:
         # Downscaled at once: the full frames of a video may not fit into memory.
         tiles = [cv2.resize(frame, _TILE, interpolation=cv2.INTER_AREA) for _, _, frame in reader]
     chosen = [tiles[row] for row in np.linspace(0, len(tiles) - 1, rows * columns).round().astype(int)]

@@ -9,11 +9,12 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 from typer import Argument
 
+import vehicle_detection as vd
 from vehicle_detection.cli import options as shared
 from vehicle_detection.cli.horizon import is_limited, search_everywhere, warn_of_horizon
 from vehicle_detection.cli.options import check_blur, drawing_option, open_model, output_option, takes
@@ -27,10 +28,6 @@ from vehicle_detection.cli.output import (
     print_line,
 )
 from vehicle_detection.errors import InvalidInputError
-
-if TYPE_CHECKING:
-    from vehicle_detection.boxes import Detections
-    from vehicle_detection.detector import Detector
 
 _CHECKED_IMAGES = 20  # images that are searched again if no vehicle was found
 
@@ -66,17 +63,14 @@ def detect(options: DetectOptions) -> None:
     Exit code 3: some images cannot be decoded, and are left out.
     """
     from vehicle_detection._common import encodable
-    from vehicle_detection.camera import Camera
-    from vehicle_detection.detector import Detector
-    from vehicle_detection.formats import write_tracks
-    from vehicle_detection.tables import TrackTable
 
     images = list(dict.fromkeys(itertools.chain.from_iterable(map(_expand, options.images))))
     _check(options, images)
     left_out: list[Path] = []
     loaded = open_model(options.model, options.classes, options.device)
+    camera = vd.Camera.dashcam(horizon=options.horizon)
     with (
-        Detector(loaded, conf=options.conf, camera=Camera.dashcam(horizon=options.horizon)) as detector,
+        vd.Detector(loaded, conf=options.conf, camera=camera) as detector,
         output_folder(options.output, "--output"),
         output_folder(options.why, "--why"),
     ):
@@ -89,8 +83,8 @@ def detect(options: DetectOptions) -> None:
             deque(found, maxlen=0)
         else:
             with option_names(path="--boxes"):
-                table = TrackTable.from_detections({encodable(str(path)): each for path, each in found})
-                rows = write_tracks(table, options.boxes)
+                table = vd.TrackTable.from_detections({encodable(name): each for name, each in found})
+                rows = vd.write_tracks(table, options.boxes)
             print_line(f"wrote {rows} boxes to {options.boxes}")
     folders = [str(folder) for folder in (options.output, options.why) if folder is not None]
     if folders:
@@ -145,15 +139,15 @@ def _check(options: DetectOptions, images: list[Path]) -> None:
 
 
 def _detect_each(
-    images: list[Path], detector: Detector, options: DetectOptions, left_out: list[Path]
-) -> Iterator[tuple[str, Detections]]:
+    images: list[Path], detector: vd.Detector, options: DetectOptions, left_out: list[Path]
+) -> Iterator[tuple[str, vd.Detections]]:
     """Detect the vehicles of each image, print them, and write what the options name.
 
     Images that cannot be decoded or are too small are listed in `left_out`, with a warning; it is an error
     if all of them are.
     """
     from vehicle_detection._common import pluralize
-    from vehicle_detection.drawing import blur_boxes, score_texts
+    from vehicle_detection.drawing import score_texts
 
     searched, too_small = False, list[str]()
     for path, image in _read_each(images, left_out):
@@ -169,7 +163,7 @@ def _detect_each(
             for box, text in zip(found.boxes.tolist(), score_texts(found))
         )
         print_line(f"{path}: {pluralize(len(found), 'vehicle')}{listed}")
-        shown = image if options.blur is None else blur_boxes(image, found.boxes, region=options.blur)
+        shown = image if options.blur is None else vd.blur_boxes(image, found.boxes, region=options.blur)
         if options.why is not None:
             _write_explanations(options.why, path.name, detector, image, shown, found)
         if options.output is not None:
@@ -183,7 +177,6 @@ def _detect_each(
 
 def _read_each(images: list[Path], left_out: list[Path]) -> Iterator[tuple[Path, Any]]:
     """Yield the images that can be decoded, warn of others and list them; it is an error if all are such."""
-    from vehicle_detection.images import read_image
     from vehicle_detection.video import is_video_file
 
     for path in images:
@@ -191,7 +184,7 @@ def _read_each(images: list[Path], left_out: list[Path]) -> Iterator[tuple[Path,
             if is_video_file(path.name):
                 raise InvalidInputError(f"image file {path} is a video; use vehicle-detection video {path}")
             with capture_stderr() as messages:
-                image = read_image(path)
+                image = vd.read_image(path)
         except InvalidInputError as error:
             left_out.append(path)
             if len(left_out) == len(images):
@@ -203,42 +196,36 @@ def _read_each(images: list[Path], left_out: list[Path]) -> Iterator[tuple[Path,
         yield path, image
 
 
-def _write_annotated(folder: Path, path: Path, image: Any, found: Detections, options: DetectOptions) -> None:
+def _write_annotated(
+    folder: Path, path: Path, image: Any, found: vd.Detections, options: DetectOptions
+) -> None:
     """Write an image with its boxes; as PNG if its own format cannot be written."""
     import cv2
 
-    from vehicle_detection.drawing import draw_detections
-    from vehicle_detection.images import write_image
-
     suffix = path.suffix if cv2.haveImageWriter(f"image{path.suffix}") else f"{path.suffix}.png"
-    drawn = draw_detections(image, found, line_width=options.line_width, scores=options.labels == "score")
-    write_image(folder / (path.stem + suffix), drawn)
+    drawn = vd.draw_detections(image, found, line_width=options.line_width, scores=options.labels == "score")
+    vd.write_image(folder / (path.stem + suffix), drawn)
 
 
 def _write_explanations(
-    folder: Path, name: str, detector: Detector, image: Any, shown: Any, found: Detections
+    folder: Path, name: str, detector: vd.Detector, image: Any, shown: Any, found: vd.Detections
 ) -> None:
     """Write a picture for each box of an image that says why it was found; it shows the image `shown`."""
     from vehicle_detection._common import atomic_write
-    from vehicle_detection.evaluation import explain
-    from vehicle_detection.notebook import plot_explanation
 
     for number, box in enumerate(found.boxes, start=1):
-        explanation = explain(detector, image, box)
+        explanation = vd.explain(detector, image, box)
         print_line(f"  {number}: {explanation}")
         with atomic_write(folder / f"{name}_{number}.png", "--why") as part:
-            picture: Any = plot_explanation(shown, explanation)
+            picture: Any = vd.notebook.plot_explanation(shown, explanation)
             picture.savefig(part)
 
 
 def _warn_if_empty(
-    found: Iterator[tuple[str, Detections]], images: Iterator[Path], detector: Detector, horizon: float
-) -> Iterator[tuple[str, Detections]]:
+    found: Iterator[tuple[str, vd.Detections]], images: Iterator[Path], detector: vd.Detector, horizon: float
+) -> Iterator[tuple[str, vd.Detections]]:
     """Pass on what is found; if that is nothing, search some images without the given horizon."""
     import numpy as np
-
-    from vehicle_detection.images import read_image
-    from vehicle_detection.tracking import estimate_horizon
 
     total = 0
     for name, vehicles in found:
@@ -248,11 +235,11 @@ def _warn_if_empty(
         return
     boxes, shape = [np.empty((0, 4))], tuple[int, ...]()
     with search_everywhere(detector.model, None) as everywhere:
-        for image in map(read_image, itertools.islice(images, _CHECKED_IMAGES)):
+        for image in map(vd.read_image, itertools.islice(images, _CHECKED_IMAGES)):
             shape = shape or image.shape[:2]
             if image.shape[:2] == shape:
                 boxes.append(everywhere.detect(image).boxes)
     estimate = None
     with contextlib.suppress(InvalidInputError):  # too few boxes
-        estimate = estimate_horizon(np.concatenate(boxes), shape)
+        estimate = vd.estimate_horizon(np.concatenate(boxes), shape)
     warn_of_horizon(f"--horizon {horizon}", estimate)

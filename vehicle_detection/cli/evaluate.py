@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from typer import Argument
 
+import vehicle_detection as vd
 from vehicle_detection.cli.options import flag, option
-from vehicle_detection.cli.output import check_distinct_paths, print_error, print_line
+from vehicle_detection.cli.output import check_targets, print_error, print_line
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from vehicle_detection.tables import FrameKey, TrackTable
+    from vehicle_detection.tables import FrameKey
 
 
 def evaluate(
@@ -44,15 +45,12 @@ def evaluate(
     """Score boxes, and tracks if there are any, against labels."""
     from json import dumps
 
-    from vehicle_detection._common import check_target, write_text
-    from vehicle_detection.evaluation import evaluate_detections, evaluate_tracks, match_names
-    from vehicle_detection.formats import read_labels
+    from vehicle_detection._common import write_text
     from vehicle_detection.tables import NO_TRACK
 
-    if json is not None:
-        check_target(json, "--json")
-        check_distinct_paths({"--json": json}, {"PREDICTIONS": predictions, "LABELS": labels})
-    found, true = read_labels(predictions, truth=labels, images=images), read_labels(labels, images=images)
+    check_targets({"--json": json}, {"PREDICTIONS": predictions, "LABELS": labels})
+    found = vd.read_labels(predictions, truth=labels, images=images)
+    true = vd.read_labels(labels, images=images)
     # Equal scores may be flags of labels, as in MOTChallenge's ground truth.
     scored = "score" in true.columns and len(set(true["score"].tolist())) > 1
     if len(found) and "score" not in found.columns and scored:
@@ -60,16 +58,16 @@ def evaluate(
             f"{labels} has scores and {predictions} has none, so they seem to be swapped; pass the "
             "predictions first, then the labels; if these are labels with scores, remove the scores"
         )
-    found = match_names(found, true.frame_keys, (str(predictions), str(labels)))
+    found = vd.evaluation.match_names(found, true.frame_keys, (str(predictions), str(labels)))
     chosen = None
     if frames is not None:
         chosen = _parse_frames(frames, true.frame_keys)
         found, true = (each.select(chosen) for each in (found, true))
     options: dict[str, Any] = {"iou": iou, "ignored_as_regions": ignored_as_regions, "frames": chosen}
-    scores: dict[str, Any] = {"detections": evaluate_detections(found, true, **options)}
+    scores: dict[str, Any] = {"detections": vd.evaluate_detections(found, true, **options)}
     unknown = [int(((boxes["track_id"] == NO_TRACK) & ~boxes["ignore"]).sum()) for boxes in (found, true)]
     if not any(unknown):
-        scores["tracks"] = evaluate_tracks(found, true, **options)
+        scores["tracks"] = vd.evaluate_tracks(found, true, **options)
     print_line("\n\n".join(each.summary() for each in scores.values()))
     _note_frames_of_one_file(found, true, chosen, predictions, labels)
     for boxes, count, file in zip((found, true), unknown, (predictions, labels)):
@@ -81,7 +79,11 @@ def evaluate(
 
 
 def _note_frames_of_one_file(
-    found: TrackTable, true: TrackTable, chosen: Collection[FrameKey] | None, predictions: Path, labels: Path
+    found: vd.TrackTable,
+    true: vd.TrackTable,
+    chosen: Collection[FrameKey] | None,
+    predictions: Path,
+    labels: Path,
 ) -> None:
     """Print a note if many frames have labels and no boxes, or boxes and no labels."""
     labelled = set(true["frame"].tolist() if chosen is None else chosen)

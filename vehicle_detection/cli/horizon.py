@@ -4,46 +4,37 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import vehicle_detection as vd
 from vehicle_detection.cli.output import print_error, print_line
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from vehicle_detection.detector import Detector
-    from vehicle_detection.tracking import HorizonEstimate
     from vehicle_detection.video import FrameSource
 
 
-def search_everywhere(model: Any, conf: float | None) -> Detector:
+def search_everywhere(model: Any, conf: float | None) -> vd.Detector:
     """Open a detector that searches all rows, whatever the horizon."""
-    from vehicle_detection.detector import Detector
-
     params = model.search_params_type.default()
-    return Detector(model, conf=conf, search_params=params.everywhere() if _has_bands(params) else None)
+    # Networks and functions search all rows anyway.
+    everywhere = params.everywhere() if hasattr(params, "everywhere") else None
+    return vd.Detector(model, conf=conf, search_params=everywhere)
 
 
-def _has_bands(params: Any) -> bool:
-    """Whether a search is of bands below the horizon; networks and functions search all rows."""
-    return hasattr(params, "everywhere")
-
-
-def is_limited(detector: Detector) -> bool:
+def is_limited(detector: vd.Detector) -> bool:
     """Whether the detector searches rows near the horizon only."""
-    params = detector.search_params
-    return _has_bands(params) and params != params.everywhere()
+    params: Any = detector.search_params
+    return hasattr(params, "everywhere") and params != params.everywhere()
 
 
-def warn_of_horizon(given: str, found: HorizonEstimate | None) -> None:
+def warn_of_horizon(given: str, found: vd.tracking.HorizonEstimate | None) -> None:
     """Warn that no vehicle was found, and print what a search of all rows found; `given` set the horizon."""
-    message = (
-        f"warning: no vehicle was found with {given}; leave it out if there are some "
-        "(a search of all rows found too few vehicles to estimate it)"
-    )
+    rest = "; leave it out if there are some (a search of all rows found too few vehicles to estimate it)"
     if found is not None:
-        message = (
-            f"warning: no vehicle was found with {given}, but a search of all rows found "
-            f"{found.n_boxes} boxes, whose horizon is {found.horizon:.2f}; use --horizon {found.horizon:.2f}"
+        rest = (
+            f", but a search of all rows found {found.n_boxes} boxes, whose horizon is "
+            f"{found.horizon:.2f}; use --horizon {found.horizon:.2f}"
         )
-    print_error(message)
+    print_error(f"warning: no vehicle was found with {given}{rest}")
 
 
 def parse_horizon(text: str) -> float:
@@ -59,27 +50,19 @@ def parse_horizon(text: str) -> float:
 
 
 def find_horizon(
-    source: FrameSource,
-    model: Any,
-    *,
-    conf: float | None,
-    start: float | None,
-    end: float | None,
-    quiet: bool,
+    source: FrameSource, model: Any, *, conf: float | None, quiet: bool, **span: float | None
 ) -> float | None:
     """Estimate the horizon of a video from its vehicles, and print the result."""
     from vehicle_detection.video import estimate_video_horizon
 
     with search_everywhere(model, conf) as detector:
-        found = estimate_video_horizon(source, detector, start=start, end=end)
-    if found is None:
-        if not quiet:
-            print_error(
-                "warning: --horizon auto: too few vehicles to estimate the horizon; searching near the middle"
-            )
-        return None
-    if not quiet:
+        found = estimate_video_horizon(source, detector, **span)
+    if found is None and not quiet:
+        print_error(
+            "warning: --horizon auto: too few vehicles to estimate the horizon; searching near the middle"
+        )
+    elif found is not None and not quiet:
         print_line(
             f"horizon {found.horizon:.3f} (standard error {found.horizon_std:.3f}, {found.n_boxes} boxes)"
         )
-    return found.horizon
+    return None if found is None else found.horizon

@@ -7,6 +7,7 @@ from typing import Any
 
 from typer import Argument
 
+import vehicle_detection as vd
 from vehicle_detection.cli.output import print_facts, print_line, print_table
 
 # Columns of the model card that a terminal has no room for.
@@ -22,9 +23,7 @@ def info(
     ),
 ) -> None:
     """Show a model's parameters, accuracy, training data and versions."""
-    from vehicle_detection.detector import load_model
-
-    loaded = load_model(model)
+    loaded = vd.load_model(model)
     title, facts = loaded.summary()
     print_facts(f"{model}: {title}", facts)
     for name, values in loaded.metadata.items():

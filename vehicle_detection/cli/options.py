@@ -10,6 +10,7 @@ from typing import Any, TypeVar, get_type_hints
 
 from typer import Option
 
+import vehicle_detection as vd
 from vehicle_detection.errors import InvalidInputError
 
 Options = TypeVar("Options")
@@ -127,9 +128,7 @@ def parse_classes(text: str | None) -> list[str | int] | None:
 
 def open_model(name: str, classes: str | None, device: Any) -> Any:
     """Load the model that the options name."""
-    from vehicle_detection.detector import load_model
-
-    return load_model(name, classes=parse_classes(classes), device=device)
+    return vd.load_model(name, classes=parse_classes(classes), device=device)
 
 
 def check_blur(region: str | None) -> None:

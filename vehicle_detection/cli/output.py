@@ -19,14 +19,12 @@ import typer
 
 from vehicle_detection.errors import DatasetError, InvalidInputError, VehicleDetectionError
 
+# Printed where distances are shown although nothing is known of the lens.
 UNKNOWN_LENS = (
     "warning: distances assume a lens of 58 degrees, and may be wrong by a factor of 2 or more; "
     "pass --fov or --camera"
 )
-"""Printed where distances are shown although nothing is known of the lens."""
-
-DAMAGED = 3
-"""Exit code of a command that left out what it could not decode."""
+DAMAGED = 3  # exit code of a command that left out what it could not decode
 
 Result = TypeVar("Result")
 

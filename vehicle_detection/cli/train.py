@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import shlex
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import vehicle_detection as vd
 from vehicle_detection.cli.options import NON_VEHICLES, PATCHES, VEHICLES, flag, option
 from vehicle_detection.cli.output import (
     capture_stderr,
@@ -14,13 +16,23 @@ from vehicle_detection.cli.output import (
     check_targets,
     name_kept_files,
     option_names,
+    output_folder,
     print_line,
     print_table,
     run_interruptible,
 )
 
-if TYPE_CHECKING:
-    from vehicle_detection.training import TrainingReport
+
+def fetch(
+    output: Path | None = option(
+        None, "DIR", "Folder, such as data; default: the user's cache.", "-o", "--output"
+    ),
+) -> None:
+    """Download the course's training patches (110 MB) once."""
+    with output_folder(output, "--output"):
+        paths = vd.fetch_patches(output, progress=sys.stderr.isatty())
+    for path in paths:
+        print_line(str(path))
 
 
 @option_names(random_state="--seed", patches_or_labels=PATCHES, patch_set=PATCHES)
@@ -45,27 +57,26 @@ def train(
 ) -> None:
     """Train a model on patches, and evaluate it on held-out patches; by default like the model "highway"."""
     from vehicle_detection._common import encodable, write_text
-    from vehicle_detection.datasets import load_training_patches
-    from vehicle_detection.features import FeatureParams
-    from vehicle_detection.training import TrainingOptions, model_card, train_and_evaluate
 
     check_distinct_paths({"--non-vehicles": non_vehicles}, {"--vehicles": vehicles})
     sources = {"--vehicles": vehicles, "--non-vehicles": non_vehicles}
     targets = check_targets({"--output": output, "--report": report, "--card": card}, sources)
     with option_names(preset="--features"):
-        presets = [FeatureParams.preset(features)]
+        presets = [vd.FeatureParams.preset(features)]
     with option_names(preset="--compare"):
-        presets += [FeatureParams.preset(name) for name in compare or ()]
+        presets += [vd.FeatureParams.preset(name) for name in compare or ()]
     if gamma is None:
         gamma = 0.0 if no_mirror else 0.4
-    training = TrainingOptions(C=C, mirror=not no_mirror, gamma=gamma, degraded=degraded, random_state=seed)
+    training = vd.TrainingOptions(
+        C=C, mirror=not no_mirror, gamma=gamma, degraded=degraded, random_state=seed
+    )
     options: dict[str, Any] = {"options": training, "split": split, "progress": True}
 
     with capture_stderr():
-        patches = load_training_patches(vehicles, non_vehicles)
+        patches = vd.load_training_patches(vehicles, non_vehicles)
 
     def train_all() -> list[Any]:
-        return [train_and_evaluate(patches, params=params, **options) for params in presets]
+        return [vd.train_and_evaluate(patches, params=params, **options) for params in presets]
 
     (classifier, evaluated), *rest = run_interruptible(train_all)
     others = [other for _, other in rest]
@@ -83,21 +94,21 @@ def train(
             words += [word for name in compare or () for word in ("--compare", name)]
             words += ["-o", output.name, "--card", card.name]
             command = shlex.join(["vehicle-detection", "train", *words])
-            text = model_card(classifier, evaluated, name=output.stem, others=others, command=command)
+            text = vd.training.model_card(
+                classifier, evaluated, name=output.stem, others=others, command=command
+            )
             write_text(card, encodable(text))
     print_line(f"wrote {', '.join(map(str, targets))}")
 
 
-def _print_report(report: TrainingReport) -> None:
-    from vehicle_detection.training import SPLITS, report_table
-
+def _print_report(report: vd.training.TrainingReport) -> None:
     print_table(
         f"{report.features}: {report.vehicles:,} vehicles, {report.non_vehicles:,} others, accuracy "
         f"{report.accuracy:.4f} on the split {report.split!r}",
-        *report_table(report),
+        *vd.training.report_table(report),
     )
     if report.calibration_error is not None:
         print_line(f"calibration error on the split 'sequences': {report.calibration_error:.4f}")
     for name, reason in report.skipped.items():
-        print_line(f"left out {SPLITS[name]!r}: {reason}")
+        print_line(f"left out {vd.training.SPLITS[name]!r}: {reason}")
     print_line(", ".join(f"{name} {seconds:.1f} s" for name, seconds in report.seconds.items()))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from typer import Argument
 
+import vehicle_detection as vd
 from vehicle_detection.cli.info import print_held_out
 from vehicle_detection.cli.options import option
 from vehicle_detection.cli.output import check_targets, name_kept_files, option_names, print_line
@@ -33,11 +34,10 @@ def train_frames(
     An interrupted training is continued by the same command.
     """
     from vehicle_detection._common import check_suffix, pluralize
-    from vehicle_detection.training import find_sources, fine_tune_network, write_curves
 
     targets = check_targets({"--output": output, "--curves": curves}, {"DATA": data})
     check_suffix(output, "--output", (".onnx",))
-    sources = find_sources(data)
+    sources = vd.training.find_sources(data)
     for source in sources:
         for part in source.sets:
             empty = sum(not len(part.labels.rows(key)) for key in part.keys)
@@ -47,7 +47,7 @@ def train_frames(
     if checkpoint.exists():
         print_line(f"continuing the training of {checkpoint}")
     try:
-        tuned = fine_tune_network(
+        tuned = vd.training.fine_tune_network(
             sources,
             initial=model,
             steps=steps,
@@ -64,7 +64,7 @@ def train_frames(
     with name_kept_files(targets):
         tuned.model.save(output)
         if curves is not None:
-            write_curves(curves, tuned.folds)
+            vd.training.write_curves(curves, tuned.folds)
     metrics = tuned.model.metadata["metrics"]
     print_held_out(metrics["held_out"], metrics["held_out_before"])
     print_line(f"wrote {', '.join(map(str, targets))}")

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import vehicle_detection as vd
 from vehicle_detection.cli.options import NON_VEHICLES, PATCHES, VEHICLES, flag, option
 from vehicle_detection.cli.output import (
     check_targets,
@@ -21,9 +22,6 @@ from vehicle_detection.errors import InvalidInputError
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from vehicle_detection.evaluation import LabelledFrames
-
-_TABLES, _FIGURES = (".csv", ".jsonl", ".parquet"), (".png", ".svg", ".pdf")
 _MAX_ROWS = 15
 
 
@@ -58,46 +56,33 @@ def tune(
     cache: Path | None = option(None, "DIR", "Folder to keep features in, such as cache."),
 ) -> None:
     """Train and measure every combination of a grid of parameters, and show the best."""
-    from vehicle_detection._common import check_choice, check_integer
-    from vehicle_detection.datasets import load_training_patches
-    from vehicle_detection.training import (
-        Halving,
-        TrialOptions,
-        compare_configurations,
-        expand_grid,
-        parse_grid,
-        search_parameters,
-        write_results,
-    )
+    from vehicle_detection._common import check_choice, check_integer, check_suffix
 
-    values = parse_grid(grid)
+    training = vd.training
+    values = training.parse_grid(grid)
     check_choice(split, "--split", ("sequences", "groups", "random"))
     check_integer(finalists, "--finalists", low=1)
     sources = {"--vehicles": vehicles, "--non-vehicles": non_vehicles}
     targets = check_targets({"--output": output, "--plot": plot}, sources)
-    for name, path, suffixes in (("--output", output, _TABLES), ("--plot", plot, _FIGURES)):
-        if path is not None and path.suffix.lower() not in suffixes:
-            raise InvalidInputError(f"{name} must end in {', '.join(suffixes)}; got {path.name!r}")
+    check_suffix(output, "--output", (".csv", ".jsonl", ".parquet"))
+    if plot is not None:
+        check_suffix(plot, "--plot", (".png", ".svg", ".pdf"))
     labelled = _read_frames(frames, labels, horizon)
     # Rows cannot be appended to Parquet, so they are stored in a .jsonl file beside it.
     parquet = output.suffix.lower() == ".parquet"
     store = output.with_suffix(".jsonl") if parquet else output
     is_new = not store.exists()
-    measured = TrialOptions(frames=labelled, cache=cache)
+    measured = training.TrialOptions(frames=labelled, cache=cache)
     options: dict[str, Any] = {"store": store, "options": measured, "progress": True}
 
     def work() -> DataFrame:
-        patches = load_training_patches(vehicles, non_vehicles, progress=sys.stderr.isatty())
+        patches = vd.load_training_patches(vehicles, non_vehicles, progress=sys.stderr.isatty())
         if halving:
-            return search_parameters(
-                patches,
-                values,
-                split=split,
-                halving=Halving(n_finalists=finalists),
-                random_state=seed,
-                **options,
-            )
-        return compare_configurations(patches, expand_grid(values), splits=split, seeds=(seed,), **options)
+            chosen = training.Halving(n_finalists=finalists)
+            options.update(split=split, halving=chosen, random_state=seed)
+            return training.search_parameters(patches, values, **options)
+        options.update(splits=split, seeds=(seed,))
+        return training.compare_configurations(patches, training.expand_grid(values), **options)
 
     table = run_interruptible(work)
     final = table[table["stage"] == ("final" if halving else "compare")]
@@ -107,32 +92,27 @@ def tune(
             store.unlink(missing_ok=True)
         raise InvalidInputError("--grid has no configuration that can be trained, for the reasons above")
     if parquet:
-        write_results(table, output)
+        training.write_results(table, output)
     if plot is not None:
         _draw(final, plot)
     print_line(f"wrote {', '.join(map(str, targets))}")
 
 
-def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None) -> LabelledFrames | None:
+def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None) -> vd.LabelledFrames | None:
     if frames is None and labels is None:
         if horizon is not None:
             raise InvalidInputError("--horizon needs --frames, which it concerns; omit it")
         return None
     if frames is None or labels is None:
         raise InvalidInputError("--frames and --labels belong together; give both")
-    from vehicle_detection.datasets import load_frames
-    from vehicle_detection.evaluation import LabelledFrames
-    from vehicle_detection.formats import read_labels
-
-    return LabelledFrames(frames.name or "frames", load_frames(frames), read_labels(labels), horizon)
+    name, true = frames.name or "frames", vd.read_labels(labels)
+    return vd.LabelledFrames(name, vd.load_frames(frames), true, horizon)
 
 
 def _show(final: DataFrame, table: DataFrame, grid: Mapping[str, Sequence[Any]]) -> None:
     """Print the best rows, with a star on the Pareto front, and the errors of failed configurations."""
-    from vehicle_detection.training import pareto_front
-
     measured = final[final["accuracy"].notna()].sort_values("accuracy", ascending=False, kind="stable")
-    front = set(pareto_front(final)["trial"])
+    front = set(vd.training.pareto_front(final)["trial"])
     # Options of which the grid has several values; the configuration is a name for the features.
     swept = [name for name, each in grid.items() if name != "C" and len(each) > 1]
     heads = ["", "configuration", *swept, "C", "accuracy", "training", "search ms"]
@@ -160,9 +140,8 @@ def _draw(table: DataFrame, path: Path) -> None:
     from matplotlib.figure import Figure
 
     from vehicle_detection._common import atomic_write
-    from vehicle_detection.notebook import plot_tradeoff
 
     figure = Figure(figsize=(7, 4.5), layout="constrained")
-    plot_tradeoff(table, ax=figure.subplots())
+    vd.notebook.plot_tradeoff(table, ax=figure.subplots())
     with atomic_write(path) as part:
         figure.savefig(part)

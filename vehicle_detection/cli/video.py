@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+import vehicle_detection as vd
 from vehicle_detection.cli.horizon import find_horizon, is_limited, search_everywhere, warn_of_horizon
 from vehicle_detection.cli.options import check_blur, open_model, takes
 from vehicle_detection.cli.output import (
@@ -23,10 +24,10 @@ from vehicle_detection.cli.output import (
     print_line,
 )
 from vehicle_detection.cli.video_options import VideoOptions
+from vehicle_detection.cli.video_outputs import SideOutputs, read_speed
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.video import FrameSource, VideoReport
 
 
@@ -39,16 +40,10 @@ def video(options: VideoOptions) -> None:
 
     Exit code 3: the source is damaged, and the copy lacks what cannot be decoded.
     """
-    from vehicle_detection.cli.video_outputs import SideOutputs
-    from vehicle_detection.video import process_video
-
     _check(options)
     outputs = SideOutputs(options)
     files = options.files().values()
-    run: dict[str, Any] = options.span() | {
-        "preset": options.preset, "workers": options.jobs, "audio": not options.no_audio,
-        "every": options.every,
-    }  # fmt: skip
+    tracking: dict[str, Any] = {"workers": options.jobs, "every": options.every, **options.span()}
     with (
         name_kept_files(files),
         output_folder(options.clips, "--clips"),
@@ -59,14 +54,16 @@ def video(options: VideoOptions) -> None:
                 # After the other checks: what is refused replaces nothing.
                 _check_run(options, source, detector)
                 announce_replaced(files)
-            done = process_video(
+            done = vd.process_video(
                 source,
                 options.output,
                 detector,
                 progress=not options.quiet,
                 show=options.show,
+                audio=not options.no_audio,
+                preset=options.preset,
                 on_result=lambda result: [write(result) for write in writers],
-                **run,
+                **tracking,
             )
         outputs.write(done, detector)
     if not options.quiet:
@@ -83,11 +80,11 @@ def video(options: VideoOptions) -> None:
         raise typer.Exit(DAMAGED)
 
 
-def _check_run(options: VideoOptions, source: FrameSource, detector: VehicleDetector) -> None:
+def _check_run(options: VideoOptions, source: FrameSource, detector: vd.VehicleDetector) -> None:
     """Refuse what `process_video` would refuse, before anything is computed or replaced."""
-    from vehicle_detection.video import check_video_target, track
+    from vehicle_detection.video import check_video_target
 
-    track(source, detector, workers=options.jobs, every=options.every, **options.span()).close()
+    vd.track(source, detector, workers=options.jobs, every=options.every, **options.span()).close()
     if options.output is not None:
         check_video_target(options.output, source.files, preset=options.preset)
 
@@ -132,21 +129,12 @@ def _check(options: VideoOptions) -> None:
 
 
 @contextlib.contextmanager
-def _open(options: VideoOptions) -> Iterator[tuple[FrameSource, VehicleDetector]]:
+def _open(options: VideoOptions) -> Iterator[tuple[FrameSource, vd.VehicleDetector]]:
     """Open the source and the detector; its horizon is estimated first if the option says so."""
-    from vehicle_detection.annotator import Annotator
-    from vehicle_detection.camera import open_camera
-    from vehicle_detection.cli.video_outputs import read_speed
-    from vehicle_detection.detector import VehicleDetector
-
-    region: Any = options.blur
-    annotator = Annotator(
-        options.draw_params(),
-        own_speed=read_speed(options.own_speed, options.gpx, options.gpx_offset),
-        diagnostics=options.diagnostics,
-        blur=region,
-    )
-    camera = open_camera(
+    drawing: dict[str, Any] = {"diagnostics": options.diagnostics, "blur": options.blur}
+    speed = read_speed(options.own_speed, options.gpx, options.gpx_offset)
+    annotator = vd.Annotator(options.draw_params(), own_speed=speed, **drawing)
+    camera = vd.open_camera(
         options.camera, fov=options.fov, height_m=options.camera_height, horizon=options.stated_horizon()
     )
     model = open_model(options.model, options.classes, options.device)
@@ -157,17 +145,17 @@ def _open(options: VideoOptions) -> Iterator[tuple[FrameSource, VehicleDetector]
             )
         if options.horizon == "auto":
             # The estimate takes seconds: refuse invalid options before it.
-            with VehicleDetector(model, conf=options.conf, camera=camera, annotator=annotator) as unsure:
+            with vd.VehicleDetector(model, conf=options.conf, camera=camera, annotator=annotator) as unsure:
                 camera.for_shape(source.info.shape)
                 _check_run(options, source, unsure)
             horizon = find_horizon(source, model, conf=options.conf, quiet=options.quiet, **options.span())
             camera = camera if horizon is None else camera.with_horizon(horizon)
-        with VehicleDetector(model, conf=options.conf, camera=camera, annotator=annotator) as detector:
+        with vd.VehicleDetector(model, conf=options.conf, camera=camera, annotator=annotator) as detector:
             yield source, detector
 
 
 def _warn_of_camera(
-    options: VideoOptions, done: VideoReport, source: FrameSource, detector: VehicleDetector
+    options: VideoOptions, done: VideoReport, source: FrameSource, detector: vd.VehicleDetector
 ) -> None:
     """Warn of distances through an unknown lens, and of a horizon with which no vehicle was found."""
     from vehicle_detection.video import estimate_video_horizon

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from typer import Argument
 
+import vehicle_detection as vd
 from vehicle_detection.cli import options as shared
 from vehicle_detection.cli.horizon import parse_horizon
 from vehicle_detection.cli.options import (
@@ -24,7 +25,6 @@ from vehicle_detection.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from vehicle_detection.annotator import DrawParams
     from vehicle_detection.video import FrameSource
 
 
@@ -119,10 +119,7 @@ class VideoOptions:
 
     def files(self) -> dict[str, Path | None]:
         """Files to write, by their options."""
-        return {
-            "--output": self.output, "--tracks": self.tracks, "--report": self.report,
-            "--events": self.events, "--srt": self.srt,
-        }  # fmt: skip
+        return {f"--{name}": getattr(self, name) for name in ("output", "tracks", "report", "events", "srt")}
 
     def span(self) -> dict[str, Any]:
         """First and last second of the source."""
@@ -132,22 +129,13 @@ class VideoOptions:
         """Return the horizon that the option states; None if it states none, or is to be estimated."""
         return None if self.horizon in (None, "auto") else parse_horizon(str(self.horizon))
 
-    def draw_params(self) -> DrawParams:
+    def draw_params(self) -> vd.DrawParams:
         """Parameters of the annotations."""
-        from vehicle_detection.annotator import DrawParams
-
         fields = [field.strip() for field in self.labels.split(",")]
         style: dict[str, Any] = {"color_by": self.color_by, "panel": self.panel, "units": self.units}
-        return DrawParams(labels=() if fields == ["none"] else fields, line_width=self.line_width, **style)
+        return vd.DrawParams(labels=() if fields == ["none"] else fields, line_width=self.line_width, **style)
 
     def open_source(self) -> FrameSource:
         """Open the source."""
-        from vehicle_detection.drive import open_trip
-
-        return open_trip(
-            self.source,
-            fps=self.fps,
-            live=self.live or None,
-            reconnect=not self.no_reconnect,
-            strict=self.strict,
-        )
+        options: dict[str, Any] = {"live": self.live or None, "reconnect": not self.no_reconnect}
+        return vd.open_trip(self.source, fps=self.fps, strict=self.strict, **options)

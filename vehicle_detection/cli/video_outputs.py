@@ -9,14 +9,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import vehicle_detection as vd
 from vehicle_detection.cli.output import option_names, print_error, print_line
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from vehicle_detection.cli.video_options import VideoOptions
-    from vehicle_detection.detector import VehicleDetector
-    from vehicle_detection.drive import Event, OwnSpeed, ReportWriter, TrackPicture
-    from vehicle_detection.tables import TrackTable
     from vehicle_detection.video import FrameSource, VideoReport
 
 # Fraction of the frames without a known own speed from which on a warning is printed.
@@ -24,16 +22,15 @@ _MAX_UNKNOWN = 0.05
 _MAX_OWN_SPEED = 500.0
 
 
-def read_speed(own_speed: str | None, gpx: Path | None, offset: float) -> OwnSpeed | None:
+def read_speed(own_speed: str | None, gpx: Path | None, offset: float) -> vd.drive.OwnSpeed | None:
     """Speed of the own vehicle: constant (km/h, or with its unit), from a file, or unknown."""
     from vehicle_detection._common import UNITS, describe
-    from vehicle_detection.drive import OwnSpeed, read_own_speed
 
     if gpx is not None:
         if own_speed is not None:
             raise InvalidInputError("--own-speed and --gpx both state the own speed; give one of them")
         with option_names(path="--gpx", offset="--gpx-offset"):
-            return read_own_speed(gpx, offset=offset)
+            return vd.read_own_speed(gpx, offset=offset)
     if offset:
         raise InvalidInputError("--gpx-offset needs --gpx; give the file, or omit the offset")
     if own_speed is None:
@@ -44,7 +41,8 @@ def read_speed(own_speed: str | None, gpx: Path | None, offset: float) -> OwnSpe
             f"--own-speed must be a speed of at most {_MAX_OWN_SPEED:g}, such as 100 (km/h) or 62mph; got "
             f"{describe(own_speed)}"
         )
-    return OwnSpeed.constant(float(found[1]) / UNITS["imperial" if found[2] == "mph" else "metric"].speed)
+    unit = UNITS["imperial" if found[2] == "mph" else "metric"].speed
+    return vd.drive.OwnSpeed.constant(float(found[1]) / unit)
 
 
 class SideOutputs:
@@ -52,45 +50,35 @@ class SideOutputs:
 
     def __init__(self, options: VideoOptions) -> None:
         from vehicle_detection._common import check_choice, check_suffix
-        from vehicle_detection.drive import EVENT_SUFFIXES, KINDS, SUBTITLE_SUFFIXES
 
         self._options = options
-        self._page: ReportWriter | None = None
-        self._table: TrackTable
-        self._events: tuple[Event, ...] = ()
+        self._page: vd.ReportWriter | None = None
+        self._table: vd.TrackTable
+        self._events: tuple[vd.drive.Event, ...] = ()
         if options.events is not None:
-            check_suffix(options.events, "--events", EVENT_SUFFIXES)
+            check_suffix(options.events, "--events", vd.drive.EVENT_SUFFIXES)
         if options.srt is not None:
-            check_suffix(options.srt, "--srt", SUBTITLE_SUFFIXES)
-        self._clip_kinds: list[str] = [*KINDS]
+            check_suffix(options.srt, "--srt", vd.drive.SUBTITLE_SUFFIXES)
+        self._clip_kinds: list[str] = [*vd.drive.KINDS]
         if options.clips_of is not None:
             if options.clips is None:
                 raise InvalidInputError("--clips-of needs --clips, the folder of the clips; add it")
             self._clip_kinds = [kind.strip() for kind in options.clips_of.split(",")]
         for kind in self._clip_kinds:
-            check_choice(kind, "--clips-of", KINDS)
+            check_choice(kind, "--clips-of", vd.drive.KINDS)
 
     @contextlib.contextmanager
     def collect(
-        self, source: FrameSource, detector: VehicleDetector
+        self, source: FrameSource, detector: vd.VehicleDetector
     ) -> Iterator[list[Callable[[Any], object]]]:
         """Yield functions that take each frame's result; the file of tracks is complete after the block."""
-        from vehicle_detection.drive import ReportWriter
-        from vehicle_detection.formats import open_tracks
-        from vehicle_detection.tables import TrackTable
-
-        options = self._options
+        options, units = self._options, detector.annotator.style.units
         writers: list[Callable[[Any], object]] = []
         if options.report is not None and options.output is not None:
+            page: dict[str, Any] = {"video": options.output, "source": options.source, "units": units}
             with option_names(path="--report"):
-                self._page = ReportWriter(
-                    options.report,
-                    video=options.output,
-                    source=options.source,
-                    detector=detector,
-                    units=detector.annotator.style.units,
-                )
-        self._table = self._page.table if self._page else TrackTable()
+                self._page = vd.ReportWriter(options.report, detector=detector, **page)
+        self._table = self._page.table if self._page else vd.TrackTable()
         # A camera that never ends would fill the memory with tracks that nobody asked for.
         wanted = options.report, options.events, options.clips, options.srt
         if not options.quiet or any(path is not None for path in wanted):
@@ -98,42 +86,44 @@ class SideOutputs:
         with contextlib.ExitStack() as stack:
             if options.tracks is not None:
                 with option_names(path="--tracks"):
-                    table = open_tracks(options.tracks, shape=source.info.shape, fps=float(source.info.fps))
+                    table = vd.open_tracks(
+                        options.tracks, shape=source.info.shape, fps=float(source.info.fps)
+                    )
                     writers.append(stack.enter_context(table))
             yield writers
 
-    def write(self, done: VideoReport, detector: VehicleDetector) -> None:
+    def write(self, done: VideoReport, detector: vd.VehicleDetector) -> None:
         """Find the events, and write all files but that of the tracks."""
-        from vehicle_detection.drive import cut_clips, write_events, write_subtitles
-
         options, fps, table = self._options, float(done.fps), self._table
         events = self._events = self._find_events(done, detector)
         if options.events is not None:
             with option_names(path="--events"):
-                write_events(events, options.events)
+                vd.write_events(events, options.events)
         if options.srt is not None:
             units = detector.annotator.style.units
             with option_names(path="--srt"):
                 own: Any = detector.annotator.own_speed
-                write_subtitles(table, options.srt, fps=fps, events=events, own_speed=own, units=units)
+                vd.write_subtitles(table, options.srt, fps=fps, events=events, own_speed=own, units=units)
         if self._page is not None:
-            pictures = self._explain(detector) if options.why else []
+            pictures: list[vd.drive.TrackPicture] = []
+            if options.why:
+                with options.open_source() as again:
+                    pictures = vd.drive.explain_tracks(detector, again, table, every=options.every)
             self._page.finish(done, events=events, pictures=pictures)
         if options.clips is not None and options.output is not None:
             # Last, because there may be thousands of clips.
             chosen = [event for event in events if event.kind in self._clip_kinds]
-            cut_clips(chosen, options.output, options.clips, fps=fps, progress=not options.quiet)
+            quiet = options.quiet
+            vd.drive.cut_clips(chosen, options.output, options.clips, fps=fps, progress=not quiet)
 
-    def _find_events(self, done: VideoReport, detector: VehicleDetector) -> tuple[Event, ...]:
+    def _find_events(self, done: VideoReport, detector: vd.VehicleDetector) -> tuple[vd.drive.Event, ...]:
         """Find the events of a processed video, and warn if the own speed is unknown for a part of it."""
         import numpy as np
-
-        from vehicle_detection.drive import find_events, own_speeds
 
         table, fps, speeds = self._table, float(done.fps), None
         own: Any = detector.annotator.own_speed
         if own is not None:
-            speeds = own_speeds(own, table, fps=fps)
+            speeds = vd.drive.own_speeds(own, table, fps=fps)
             unknown = float(np.isnan(speeds).mean()) if len(speeds) else 0.0
             if unknown > _MAX_UNKNOWN and not self._options.quiet:
                 print_error(
@@ -141,23 +131,14 @@ class SideOutputs:
                     "--gpx-offset, and that the file has no gaps of over 5 s"
                 )
         camera = detector.camera.for_shape(done.shape)
-        return find_events(table, fps=fps, shape=done.shape, camera=camera, own_speed_mps=speeds)
-
-    def _explain(self, detector: VehicleDetector) -> list[TrackPicture]:
-        """Explain a box of each vehicle, for the report."""
-        from vehicle_detection.drive import explain_tracks
-
-        with self._options.open_source() as source:
-            return explain_tracks(detector, source, self._table, every=self._options.every)
+        return vd.find_events(table, fps=fps, shape=done.shape, camera=camera, own_speed_mps=speeds)
 
     def print_summary(self, done: VideoReport) -> None:
         """Print the counts of a drive in one line, and the number of events of each other kind in another."""
-        from vehicle_detection.drive import COUNTED, KINDS, count_vehicles
-
         if not len(self._table.frame_keys):
             return
-        print_line(count_vehicles(self._events, self._table, fps=float(done.fps)).summary())
-        kinds = Counter(event.kind for event in self._events if event.kind not in COUNTED)
+        print_line(vd.count_vehicles(self._events, self._table, fps=float(done.fps)).summary())
+        kinds = Counter(event.kind for event in self._events if event.kind not in vd.drive.COUNTED)
         if kinds:
-            listed = ", ".join(f"{kinds[kind]} {KINDS[kind]}" for kind in KINDS if kinds[kind])
-            print_line(f"events: {listed}")
+            listed = (f"{kinds[kind]} {name}" for kind, name in vd.drive.KINDS.items() if kinds[kind])
+            print_line(f"events: {', '.join(listed)}")

@@ -7,14 +7,13 @@ those between two searched frames, which wait for their tracks.
 from __future__ import annotations
 
 import contextlib
-import functools
 import logging
 import math
 import os
 import threading
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -160,11 +159,9 @@ class _Searched:
     result: Any
 
 
-class _Pipeline:
-    """Decodes in a thread, searches in a pool, and tracks in the calling thread.
-
-    The decoding thread also starts and ends the reader: Python raises KeyboardInterrupt in the main thread,
-    where it must not interrupt the start of a process. The first error stops everything.
+@dataclass(frozen=True, kw_only=True)
+class _Plan:
+    """What `track` is to do.
 
     With an `interval` above 1, only every n-th frame and the first one of each scene are searched, and each
     frame after a gap of a live source. The frames between wait for the next searched frame, and get
@@ -172,25 +169,31 @@ class _Pipeline:
     that is confirmed later is shown in them, too. Up to `lookahead` frames are decoded ahead.
     """
 
-    def __init__(
-        self,
-        open_reader: Callable[[], Reader],
-        detector: Any,
-        workers: int,
-        interval: int,
-        *,
-        shape: tuple[int, ...],
-        delay: int,
-        lookahead: int,
-        frames: bool,
-    ) -> None:
-        self._open_reader, self._detector, self._shape = open_reader, detector, shape
-        self._interval, self._delay, self._keeps_frames = interval, delay, frames
+    source: FrameSource
+    detector: Any
+    first: int
+    count: int | None
+    workers: int
+    interval: int
+    delay: int
+    lookahead: int
+    frames: bool  # whether the results hold their frames
+
+
+class _Pipeline:
+    """Decodes in a thread, searches in a pool, and tracks in the calling thread.
+
+    The decoding thread also starts and ends the reader: Python raises KeyboardInterrupt in the main thread,
+    where it must not interrupt the start of a process. The first error stops everything.
+    """
+
+    def __init__(self, plan: _Plan) -> None:
+        self._plan, self._detector = plan, plan.detector
         self.stages: defaultdict[str, float] = defaultdict(float)
         self.missed = 0  # frames that a live source dropped
         self.damage = ""  # what is damaged in the source; known after the last frame
-        self._queue: ClosableQueue[_QueuedFrame] = ClosableQueue(lookahead)
-        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="vehicle-search")
+        self._queue: ClosableQueue[_QueuedFrame] = ClosableQueue(plan.lookahead)
+        self._pool = ThreadPoolExecutor(plan.workers, thread_name_prefix="vehicle-search")
         self._reader: Reader | None = None
         self._lock = threading.Lock()
         self._aborted = self.stopped = False
@@ -225,7 +228,7 @@ class _Pipeline:
     def _decode_in_thread(self) -> None:
         error: BaseException | None = None
         try:
-            with self._open_reader() as reader:
+            with self._plan.source.read(self._plan.first, self._plan.count) as reader:
                 with self._lock:
                     if self._aborted:
                         return
@@ -252,9 +255,9 @@ class _Pipeline:
             skipped += 1
             missed = index - expected if expected is not None else 0
             search = None
-            if expected is None or missed or cut or skipped >= self._interval:
+            if expected is None or missed or cut or skipped >= self._plan.interval:
                 search, skipped = self._pool.submit(self._search, frame), 0
-            kept = frame if self._keeps_frames else None
+            kept = frame if self._plan.frames else None
             self._queue.put(_QueuedFrame(moment, kept, cut, search, missed))
             del frame, kept
             self.missed += missed
@@ -268,7 +271,7 @@ class _Pipeline:
         """Track the searched frames, and yield the results of all frames in their order."""
         waiting: list[_QueuedFrame] = []
         held: deque[_Searched] = deque()
-        before = None
+        before, delay = None, self._plan.delay
         for item in self._queue:
             if item.search is None:
                 waiting.append(item)
@@ -276,11 +279,11 @@ class _Pipeline:
             held.append(_Searched(waiting, item, self._track(item, waiting)))
             waiting = []
             del item  # free the frame before waiting for the next one
-            if self._delay:
+            if delay:
                 results = backfill_results([searched.result for searched in held])
                 for searched, result in zip(held, results, strict=True):
                     searched.result = result
-            if len(held) > self._delay:
+            if len(held) > delay:
                 result = held[0].result
                 yield from self._release(before, held.popleft())
                 before = result
@@ -304,14 +307,14 @@ class _Pipeline:
         items, results = searched.between, list[Any]()
         if items:
             times = [item.time for item in items]
-            results = interpolate_results(before, searched.result, times, self._shape)
+            results = interpolate_results(before, searched.result, times, self._plan.source.info.shape)
         if searched.item is not None:
             items, results = [*items, searched.item], [*results, searched.result]
         for item, result in zip(items, results, strict=True):
             for name, seconds in result.seconds.items():
                 if name != "search":  # measured here, because a detector may omit it
                     self.stages[name] += seconds
-            yield replace(result, frame=item.frame) if self._keeps_frames else result
+            yield replace(result, frame=item.frame) if self._plan.frames else result
             item.frame = None
 
 
@@ -323,24 +326,15 @@ class TrackRun(Closing):
     """
 
     def __init__(
-        self,
-        source: FrameSource,
-        detector: Any,
-        pipeline: _Pipeline,
-        *,
-        total: int | None,
-        span: tuple[int, float | None],
-        has_frames: bool,
-        progress: bool,
-        on_close: contextlib.ExitStack,
+        self, plan: _Plan, *, end: float | None, progress: bool, on_close: contextlib.ExitStack
     ) -> None:
-        self.source, self.info, self.detector, self.has_frames = source, source.info, detector, has_frames
-        self._pipeline, self._on_close, self._on_end = pipeline, on_close, contextlib.ExitStack()
+        self.source, self.info, self.detector = plan.source, plan.source.info, plan.detector
+        self.has_frames, self._first, self._end, self._progress = plan.frames, plan.first, end, progress
+        self._total = plan.count or max(self.info.frames - plan.first, 0) or None
+        self._pipeline = _Pipeline(plan)
+        self._results = self._pipeline.run()
+        self._on_close, self._on_end = on_close, contextlib.ExitStack()
         self._entered = self.stopped = False
-        self._first, self._end = span  # the first frame, and the end in seconds
-        self._results = pipeline.run()
-        self._progress = progress
-        self._total = total
         self._frames, self._track_ids = 0, set[int]()
         self._started = self._logged = self._seconds = 0.0
 
@@ -482,26 +476,18 @@ def track(
         interval = every or (1 if getattr(found, "searches_every_frame", True) else search_interval(fps))
         params = getattr(found, "track_params", None)
         ahead = min(n_workers * interval, _LOOKAHEAD_BYTES // math.prod(info.shape))
-        pipeline = _Pipeline(
-            functools.partial(opened.read, first, count),
-            found,
-            n_workers,
-            interval,
-            shape=info.shape,
+        plan = _Plan(
+            source=opened,
+            detector=found,
+            first=first,
+            count=count,
+            workers=n_workers,
+            interval=interval,
             delay=0 if opened.live or params is None else search_delay(params, fps, interval),
             lookahead=max(n_workers, ahead) + 1,
             frames=frames,
         )
-        return TrackRun(
-            opened,
-            found,
-            pipeline,
-            total=count or max(info.frames - first, 0) or None,
-            span=(first, end),
-            has_frames=frames,
-            progress=progress,
-            on_close=stack.pop_all(),
-        )
+        return TrackRun(plan, end=end, progress=progress, on_close=stack.pop_all())
 
 
 @contextlib.contextmanager

@@ -179,27 +179,27 @@ class _VideoSegments(FrameSource):
             (stream_duration(path, info) if info.has_audio else None) or float(info.frames / info.fps)
             for path, info in zip(paths, infos, strict=True)
         ]
-        format_ = {"width": first.width, "height": first.height, "fps": first.fps}
-        self._infos = [
+        self.infos = [
             replace(
                 info,
+                width=first.width,
+                height=first.height,
+                fps=first.fps,
                 frames=round(length * first.fps),
                 constant_rate=info.constant_rate and info.fps == first.fps,
-                **format_,
             )
             for info, length in zip(infos, lengths, strict=True)
         ]
         sound = all(info.has_audio and info.audio_format == first.audio_format for info in infos)
         self._sound_differs = first.has_audio and not sound
-        total = sum(info.frames for info in self._infos)
+        total = sum(info.frames for info in self.infos)
         whole = replace(first, frames=total, duration=sum(lengths), start_time=0.0)
         if not sound:
             whole = replace(whole, audio_track=None, audio_codec=None)
         super().__init__(f"{paths[0]} to {paths[-1].name}", whole, paths)
 
     def read(self, first: int = 0, count: int | None = None) -> Reader:
-        segments = list(zip(self.files, self._infos, strict=True))
-        return _SegmentReader(self.info, segments, first, count, strict=self.strict)
+        return _SegmentReader(self, first, count)
 
     def audio(self, first: int = 0, end: float | None = None) -> AudioSource | None:
         if self._sound_differs:
@@ -213,34 +213,27 @@ class _VideoSegments(FrameSource):
         """Join the sound of the segments."""
         parent = Path(tempfile.gettempdir())
         folder = self._on_close.enter_context(temporary_folder(parent, "vehicle-segments"))
-        # A path that is not UTF-8 keeps its bytes.
-        with (folder / "segments.txt").open(
-            "w", encoding="utf-8", errors="surrogateescape", newline="\n"
-        ) as file:
-            for path, info in zip(self.files, self._infos, strict=True):
-                quoted = str(path.resolve()).replace("'", r"'\''")
-                seconds = float(info.frames / info.fps)
-                begin = info.first_timestamp
-                file.write(f"file '{quoted}'\ninpoint {begin:.6f}\n")
-                file.write(f"outpoint {begin + seconds:.6f}\nduration {seconds:.6f}\n")
+        listing = folder / "segments.txt"
+        text = ""
+        for path, info in zip(self.files, self.infos, strict=True):
+            quoted = str(path.resolve()).replace("'", r"'\''")
+            begin, seconds = info.first_timestamp, float(info.frames / info.fps)
+            text += f"file '{quoted}'\ninpoint {begin:.6f}\n"
+            text += f"outpoint {begin + seconds:.6f}\nduration {seconds:.6f}\n"
+        listing.write_bytes(
+            text.encode("utf-8", "surrogateescape")
+        )  # a path that is not UTF-8 keeps its bytes
         # Times as in the list: the first sound may lie before 0, which ffmpeg would take for the start.
-        options = ("-seek_timestamp", "1", "-f", "concat", "-safe", "0", "-i", f"file:{file.name}")
+        options = ("-seek_timestamp", "1", "-f", "concat", "-safe", "0", "-i", f"file:{listing}")
         return AudioSource(input=options, start=float(first / self.info.fps), length=length)
 
 
 class _SegmentReader(Reader):
     """Reader of the frames of several files, one after the other."""
 
-    def __init__(
-        self,
-        info: VideoInfo,
-        segments: Sequence[tuple[Path, VideoInfo]],
-        first: int,
-        count: int | None,
-        *,
-        strict: bool,
-    ) -> None:
-        self.info, self._segments, self._strict = info, list(segments), strict
+    def __init__(self, source: _VideoSegments, first: int, count: int | None) -> None:
+        self.info, self._strict = source.info, source.strict
+        self._segments = list(zip(source.files, source.infos, strict=True))
         self._index, self._end = first, math.inf if count is None else first + count
         self._lock = threading.Lock()
         self._killed = False
@@ -324,11 +317,10 @@ def open_source(
     Parameters
     ----------
     source
-        - a video file, or a named pipe;
+        - a video file, or a named pipe; ``"-"``: a video on standard input;
         - a list of files: consecutive videos, which become one, or images; `open_trip` finds the files of a
           trip in a folder;
         - a folder or a glob pattern with images, in the order of their names, or with one video;
-        - ``"-"``: a video on standard input;
         - a camera: its number (``0`` or ``"0"``) or device (``"/dev/video0"``);
         - a network stream: ``rtsp://``, ``rtmp://``, ``udp://``, ``srt://``, or ``http(s)://``, which may
           also be a file;
@@ -383,10 +375,9 @@ def _open(source: object, fps: float, live: bool | None, reconnect: bool) -> Fra
             "time) with frames of your own"
         )
     text = os.fsdecode(source)
-    scheme = _URL.match(text)
     if text == "-":
         return _open_stdin(bool(live))
-    if scheme is not None:
+    if scheme := _URL.match(text):
         return _open_url(text, scheme[1].lower(), fps, live, reconnect)
     path = check_path(text, "source", kind="the path of a video file")
     if (text.isdecimal() and not path.exists()) or text.startswith("/dev/video"):

@@ -24,7 +24,7 @@ from vehicle_detection._common import (
     check_choice,
     check_flags,
     check_path,
-    check_target,
+    check_suffix,
     describe,
     temporary_folder,
 )
@@ -57,18 +57,11 @@ _SYNCHRONIZED = "aresample=async=1:min_hard_comp=0.02"
 class FrameWriter(Closing):
     """Writer of ``(H, W, 3)`` uint8 RGB frames as H.264 at a constant rate, with the audio of another file.
 
-    H.264 that every player supports needs even sides, so odd ones are extended by one pixel, which repeats
-    the last column or row.
+    H.264 that every player supports needs even sides, so odd ones are extended by one pixel.
     """
 
     def __init__(
-        self,
-        path: Path,
-        info: VideoInfo,
-        *,
-        name: str,
-        preset: str,
-        audio: AudioSource | None = None,
+        self, path: Path, info: VideoInfo, *, name: str, preset: str, audio: AudioSource | None
     ) -> None:
         """Start ffmpeg, which writes to `path`; `name` names the video in errors."""
         container = CONTAINERS[path.suffix.lower()]
@@ -80,20 +73,18 @@ class FrameWriter(Closing):
         self._channels = np.empty((3, height, width), np.uint8)
         video = ["-f", "rawvideo", "-pixel_format", "yuv420p", "-video_size", f"{width}x{height}"]
         video += ["-framerate", str(info.fps)]
-        sound: list[str] = []
-        mapped = ["-map", "0:v:0"]
+        sound, mapped = list[str](), ["-map", "0:v:0"]
         if audio is not None:
             lead = audio.start - audio.audio_offset
-            sound += ["-ss", f"{audio.start:.6f}"] if lead > 0 else []
-            sound += ["-itsoffset", f"{-lead:.6f}"] if lead < 0 else []
+            if lead:
+                sound += ["-ss", f"{audio.start:.6f}"] if lead > 0 else ["-itsoffset", f"{-lead:.6f}"]
             sound += ["-vn", *audio.input]
             # Matroska has no times before 0, for the part of a packet before the first frame.
             copyable = audio.copyable and (lead <= 0 or container != "matroska")
             copied = copyable and info.audio_codec in _COPIED_AUDIO[container]
-            mapped += ["-map", f"1:a:{info.audio_track}"]
             end = "" if audio.length is None else f",atrim=end={audio.length:.6f}"
             encoded = ["-c:a", "aac", "-b:a", "192k", "-af", _SYNCHRONIZED + end]
-            mapped += ["-c:a", "copy"] if copied else encoded
+            mapped += ["-map", f"1:a:{info.audio_track}", *(["-c:a", "copy"] if copied else encoded)]
         filters = "setparams=colorspace=smpte170m:color_primaries=bt709:color_trc=bt709:range=tv"
         encoder = ["-vf", filters, "-c:v", "libx264", "-preset", preset, "-fps_mode", "passthrough"]
         # Chapters and other metadata are those of the whole source, and its title and place may be private.
@@ -103,11 +94,6 @@ class FrameWriter(Closing):
         options = ["-y", *video, "-i", "pipe:0", *sound, *mapped, *encoder, *self._muxer, f"file:{path}"]
         self._process = Process(options, stdin=True)
 
-    @property
-    def cpu_seconds(self) -> float:
-        """Processor time of ffmpeg, known after it has ended."""
-        return self._process.cpu_seconds
-
     def kill(self) -> None:
         """End ffmpeg at once, from any thread; a thread that writes sees an error."""
         self._process.kill()
@@ -115,6 +101,7 @@ class FrameWriter(Closing):
     def close(self) -> None:
         """End ffmpeg if it is still running."""
         self._process.close()
+        self.cpu_seconds = self._process.cpu_seconds
 
     def write(self, frame: NDArray[np.uint8]) -> None:
         """Send one frame to ffmpeg."""
@@ -190,8 +177,8 @@ def write_video(
     """Draw the results of `track` on their frames, and write them to a video; a `VideoError` if that fails.
 
     The video is H.264 in yuv420p, which browsers play, with the frame rate, all frames and the sound of the
-    source. The rotation stored in the source is applied. A varying frame rate is converted to a constant one.
-    An odd width or height is extended by one pixel, which repeats the last column or row.
+    source, upright. A varying frame rate is converted to a constant one. An odd width or height is extended
+    by one pixel, which repeats the last column or row.
 
     Parameters
     ----------
@@ -206,8 +193,7 @@ def write_video(
         Keep the sound. It is copied if the whole video is processed and every player supports its codec,
         otherwise it is encoded as AAC.
     preset
-        Speed of the encoder: "ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow",
-        "slower", "veryslow" or "placebo".
+        Speed of the H.264 encoder, from "ultrafast" to "placebo"; `PRESETS` of `vehicle_detection.video`.
     show
         Show the annotated frames in a window, or in a notebook below the cell. Closing the window, or the key
         Escape, ends the run and completes the target.
@@ -282,18 +268,10 @@ def process_video(
 ) -> VideoReport:
     """Detect and track the vehicles of a video, and write a copy with their boxes: `track` and `write_video`.
 
-    Parameters
-    ----------
-    source, progress, **options
-        As in `track`: ``start``, ``end``, ``every`` and ``workers``.
-    target, audio, preset, show, on_result
-        As in `write_video`. Without a target and `show`, nothing is drawn.
-    detector
-        A `VehicleDetector`, or another object with its methods ``search``, ``track`` and ``reset``; its
-        ``annotator`` draws.
+    `source`, `detector`, `progress`, ``start``, ``end``, ``every`` and ``workers`` are those of `track`, the
+    others those of `write_video`. The detector's ``annotator`` draws; without a target and `show`, nothing
+    is drawn.
 
-    Examples
-    --------
     >>> from vehicle_detection import VehicleDetector  # doctest: +SKIP
     >>> print(process_video("drive.mp4", "found.mp4", VehicleDetector()))  # doctest: +SKIP
     """
@@ -318,9 +296,9 @@ class _Drawing:
 
     def draw(self, result: FrameResult) -> tuple[NDArray[np.uint8], int]:
         """Return the picture of a result, and the number of frames that were dropped before it."""
-        assert result.frame is not None
-        start = time.perf_counter()
-        drawn = self._annotator.draw(result.frame, result)
+        start, frame = time.perf_counter(), result.frame
+        assert frame is not None
+        drawn = self._annotator.draw(frame, result)
         if getattr(drawn, "shape", None) != self._shape or drawn.dtype != np.uint8:
             raise InvalidInputError(
                 f"annotator.draw must return a {self._shape} uint8 array, got {describe(drawn)}; "
@@ -453,11 +431,9 @@ def _open_writer(
 def check_video_target(target: object, sources: Sequence[Path] = (), *, preset: str = "veryfast") -> Path:
     """Return the path of a video that can be written and is none of the sources."""
     check_choice(preset, "preset", PRESETS)
-    path = check_target(check_path(target, "target", kind="the path of a video file"))
-    if path.suffix.lower() not in CONTAINERS:
-        raise InvalidInputError(
-            f"target must end in {', '.join(CONTAINERS)}; got {path.name!r}, use {path.stem + '.mp4'!r}"
-        )
+    path = check_suffix(
+        check_path(target, "target", kind="the path of a video file"), "target", tuple(CONTAINERS)
+    )
     if path.exists() and any(path.samefile(source) for source in sources):
         raise InvalidInputError(f"target {path} is the source; choose another name")
     return path
