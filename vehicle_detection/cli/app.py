@@ -107,18 +107,14 @@ class _Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         replace_unprintable()
-        with _print_system_errors():
-            return self._invoke(ctx)
-
-    def _invoke(self, ctx: Any) -> Any:
         try:
-            with raise_on_signals(), print_warnings(), _print_usage_error():
+            with _print_system_errors(), raise_on_signals(), print_warnings(), _print_usage_error():
                 return super().invoke(ctx)
-        except (InvalidInputError, DatasetError) as error:
-            print_error(f"error: {rename_argument(str(error), self._option_names(ctx))}")
-            raise typer.Exit(BAD_INPUT) from None
         except VehicleDetectionError as error:
-            print_error(f"error: {error}")
+            message = str(error)
+            if isinstance(error, (InvalidInputError, DatasetError)):
+                message = rename_argument(message, self._option_names(ctx))
+            print_error(f"error: {message}")
             raise typer.Exit(BAD_INPUT) from None
         except KeyboardInterrupt as error:
             print_error(f"interrupted{error}")

@@ -146,6 +146,8 @@ def _detect_each(
     Images that cannot be decoded or are too small are listed in `left_out`, with a warning; it is an error
     if all of them are.
     """
+    import cv2
+
     from vehicle_detection._common import pluralize
     from vehicle_detection.drawing import score_texts
 
@@ -167,7 +169,11 @@ def _detect_each(
         if options.why is not None:
             _write_explanations(options.why, path.name, detector, image, shown, found)
         if options.output is not None:
-            _write_annotated(options.output, path, shown, found, options)
+            # As PNG if its own format cannot be written.
+            suffix = path.suffix if cv2.haveImageWriter(f"image{path.suffix}") else f"{path.suffix}.png"
+            scores = options.labels == "score"
+            drawn = vd.draw_detections(shown, found, line_width=options.line_width, scores=scores)
+            vd.write_image(options.output / (path.stem + suffix), drawn)
         yield path.name, found
     if too_small and not searched:
         raise InvalidInputError(too_small[0])
@@ -194,17 +200,6 @@ def _read_each(images: list[Path], left_out: list[Path]) -> Iterator[tuple[Path,
         for message in messages:
             print_error(f"warning: {path}: {message}")
         yield path, image
-
-
-def _write_annotated(
-    folder: Path, path: Path, image: Any, found: vd.Detections, options: DetectOptions
-) -> None:
-    """Write an image with its boxes; as PNG if its own format cannot be written."""
-    import cv2
-
-    suffix = path.suffix if cv2.haveImageWriter(f"image{path.suffix}") else f"{path.suffix}.png"
-    drawn = vd.draw_detections(image, found, line_width=options.line_width, scores=options.labels == "score")
-    vd.write_image(folder / (path.stem + suffix), drawn)
 
 
 def _write_explanations(

@@ -102,12 +102,10 @@ class _LogPrinter(logging.Handler):
 
 @contextlib.contextmanager
 def print_warnings() -> Iterator[None]:
-    """Print the warnings that the library logs in the block, one line each.
-
-    A terminal also shows that kernels are compiled, because that takes long; elsewhere, the progress of a
-    video is printed once a minute in place of a bar.
-    """
+    """Print the warnings that the library logs in the block, one line each."""
     logger = logging.getLogger("vehicle_detection")
+    # A terminal also shows that kernels are compiled, because that takes long; elsewhere, the progress of a
+    # video is printed once a minute in place of a bar.
     notes = logger.getChild("_kernels" if sys.stderr.isatty() else "video.engine")
     printer, level = _LogPrinter(), notes.level
     logger.addHandler(printer)
@@ -287,8 +285,8 @@ def output_folder(folder: Path | None, option: str) -> Iterator[None]:
             )
         yield
     except BaseException:
-        for path in created:
-            with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):
+            for path in created:
                 path.rmdir()
         raise
 

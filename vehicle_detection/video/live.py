@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,11 +45,10 @@ _STEADY_SECONDS = 10.0
 
 
 class _LiveProcess:
-    """An ffmpeg that decodes a stream from its first frame on.
+    """An ffmpeg that decodes a stream to YUV4MPEG2, whose header states the frame size and the constant rate.
 
-    ffmpeg writes YUV4MPEG2, whose header states the frame size and rate, at a constant rate: the times of
-    the frames are those of the stream. With `like`, frames get the size and rate of another process. With
-    `timed`, a stream without data for some seconds has ended.
+    With `like`, frames get the size and rate of another process. With `timed`, a stream without data for
+    some seconds has ended.
     """
 
     def __init__(
@@ -64,10 +64,11 @@ class _LiveProcess:
             filters = f"scale={like.width}:{like.height}:out_color_matrix=bt601:out_range=tv"
             rate = ("-r", str(like.fps))
         output = ("-map", "0:V:0", "-vf", filters, *rate, "-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe")
-        nostdin = () if stdin is not None else ("-nostdin",)
-        descriptor: bool | int = False if stdin is None else stdin
-        command = (*nostdin, *pixel_limit(), *options, *output, "pipe:1")
-        self.process = Process(command, stdin=descriptor, stdout=True)
+        command = (*pixel_limit(), *options, *output, "pipe:1")
+        if stdin is None:
+            self.process = Process(("-nostdin", *command), stdout=True)
+        else:
+            self.process = Process(command, stdin=stdin, stdout=True)
 
     def read_info(self) -> VideoInfo:
         """Read the header of the stream."""
@@ -119,11 +120,11 @@ class _LiveProcess:
         return not self._stalled
 
 
-class LiveStream:
-    """A stream that is read once, from its first frame on.
+class LiveStream(Reader):
+    """Frames of a stream, which is opened at once and read once: in the range that `start` chooses.
 
-    With `reconnect`, a network stream that breaks off or stalls is opened again, a limited number of times
-    in a row; the frames that were missed leave a gap in the numbers.
+    With `reconnect`, a network stream that breaks off or stalls is opened again, some times in a row; missed
+    frames leave a gap in the numbers.
     """
 
     def __init__(
@@ -135,17 +136,70 @@ class LiveStream:
         network: bool = False,
         reconnect: bool = False,
     ) -> None:
-        self.name = name
-        self._options, self._stdin, self._network = tuple(options), stdin, network
+        self.name, self._options, self._stdin, self._network = name, tuple(options), stdin, network
         self._delays = _RECONNECT_DELAYS if network and reconnect else ()
         self._attempts = 0
         self._lock = threading.Lock()
         self._killed = threading.Event()
         self._process: _LiveProcess | None = None
-        self.cpu_seconds = 0.0  # processor time of the processes that have ended
         self._number = -1  # of the last frame
         self.info = self._open(None)
         self._opened = self._last_read = time.monotonic()
+        height, width = self.info.shape[:2]
+        self._planes_shape = (height * 3 // 2, width)
+        self._channels = np.empty((3, height, width), np.uint8)
+        self._newest: ClosableQueue[tuple[int, NDArray[np.uint8]]] = ClosableQueue(1)
+        self._thread: threading.Thread | None = None
+
+    def start(self, *, drop: bool, first: int = 0, count: int | None = None) -> Self:
+        """Choose the frames to read.
+
+        With `drop`, a thread reads all of them, and the iterator returns the first one, then the newest ones:
+        a slow consumer sees gaps in the indices. Without, ffmpeg and the sender wait for the consumer.
+        """
+        self._first, self._end = first, math.inf if count is None else first + count
+        self._frames = self._read_range()
+        if drop:
+            self._thread = threading.Thread(target=self._read_all, name="vehicle-live", daemon=True)
+            self._frames = iter(self._newest)
+            self._thread.start()
+        return self
+
+    def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
+        try:
+            number, planes = next(self._frames)
+        except QueueClosed:
+            raise StopIteration from None
+        except StopIteration:
+            if self._killed.is_set() or self._number >= self._first:
+                raise
+            start = float(self._first / self.info.fps)
+            raise VideoError(f"{self.name} has no frame after {start:g} s ({self._reason()})") from None
+        frame = rgb_from_planes(planes, ColorEncoding(), self._channels)
+        return number, float(number / self.info.fps), frame
+
+    def _read_range(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Yield the numbers and planes of the chosen frames."""
+        while not self._killed.is_set() and self._number + 1 < self._end:
+            planes = np.empty(self._planes_shape, np.uint8)
+            number = self.read(planes)
+            if number is None:
+                return
+            if self._first <= number < self._end:
+                yield number, planes
+
+    def _read_all(self) -> None:
+        """Read until the end of the stream, and keep the first frame until it is taken, then the newest."""
+        error = None
+        try:
+            for count, item in enumerate(self._read_range()):
+                self._newest.put(item, replace=count > 1)
+        except QueueClosed:
+            pass
+        except BaseException as caught:  # raised in the thread of the consumer
+            error = None if self._killed.is_set() else caught
+        finally:
+            self._newest.finish(error)
 
     def _open(self, like: VideoInfo | None) -> VideoInfo:
         """Start ffmpeg, in place of one that has ended."""
@@ -216,7 +270,7 @@ class LiveStream:
         _LOGGER.warning("%s, and opening it again has failed %d times (%s)", place, self._attempts, reason)
         return False
 
-    def reason(self) -> str:
+    def _reason(self) -> str:
         """Last message of ffmpeg."""
         return last_line("" if self._process is None else self._process.process.log())
 
@@ -226,81 +280,6 @@ class LiveStream:
         with self._lock:
             if self._process is not None:
                 self._process.process.kill()
-
-    def close(self) -> None:
-        """End ffmpeg."""
-        self.kill()
-        with self._lock, contextlib.suppress(OSError):
-            self._end_process()
-
-
-class LiveReader(Reader):
-    """Frames of a `LiveStream`, in order: an iterator of ``(index, time, frame)`` and a context manager.
-
-    With `drop`, a thread reads all frames, and the iterator returns the first one, then the newest ones: a
-    slow consumer sees gaps in the indices. Without, ffmpeg and the sender wait for the consumer.
-    """
-
-    def __init__(self, stream: LiveStream, *, drop: bool, first: int = 0, count: int | None = None) -> None:
-        self.info = stream.info
-        self._stream = stream
-        self._first, self._end = first, math.inf if count is None else first + count
-        self._number = -1  # of the last frame read
-        height, width = self.info.shape[:2]
-        self._planes_shape = (height * 3 // 2, width)
-        self._channels = np.empty((3, height, width), np.uint8)
-        self._killed = False
-        self._newest: ClosableQueue[tuple[int, NDArray[np.uint8]]] = ClosableQueue(1)
-        self._thread = None
-        self._frames = self._read()
-        if drop:
-            self._thread = threading.Thread(target=self._read_all, name="vehicle-live", daemon=True)
-            self._frames = iter(self._newest)
-            self._thread.start()
-
-    def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
-        try:
-            number, planes = next(self._frames)
-        except QueueClosed:
-            raise StopIteration from None
-        except StopIteration:
-            if self._killed or self._number >= self._first:
-                raise
-            start = float(self._first / self.info.fps)
-            raise VideoError(
-                f"{self._stream.name} has no frame after {start:g} s ({self._stream.reason()})"
-            ) from None
-        frame = rgb_from_planes(planes, ColorEncoding(), self._channels)
-        return number, float(number / self.info.fps), frame
-
-    def _read(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield the numbers and planes of the frames of the range."""
-        while not self._killed and self._number + 1 < self._end:
-            planes = np.empty(self._planes_shape, np.uint8)
-            number = self._stream.read(planes)
-            if number is None:
-                return
-            self._number = number
-            if self._first <= number < self._end:
-                yield number, planes
-
-    def _read_all(self) -> None:
-        """Read until the end of the stream, and keep the first frame until it is taken, then the newest."""
-        error = None
-        try:
-            for count, item in enumerate(self._read()):
-                self._newest.put(item, replace=count > 1)
-        except QueueClosed:
-            pass
-        except BaseException as caught:  # raised in the thread of the consumer
-            error = None if self._killed else caught
-        finally:
-            self._newest.finish(error)
-
-    def kill(self) -> None:
-        """End ffmpeg at once, from any thread; a thread that reads sees the end."""
-        self._killed = True
-        self._stream.kill()
         self._newest.abort()
 
     def close(self) -> None:
@@ -308,5 +287,5 @@ class LiveReader(Reader):
         self.kill()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
-        self._stream.close()
-        self.cpu_seconds = self._stream.cpu_seconds
+        with self._lock, contextlib.suppress(OSError):
+            self._end_process()

@@ -166,8 +166,7 @@ def _probe(path: Path | str) -> VideoInfo:
 def _read_log(path: Path | str) -> tuple[str, str, str]:
     """Decode the first frame of a video, with square pixels; raise a VideoError if there is none.
 
-    Returns the part of ffmpeg's log that describes the file, the part about the filters and the frame, and
-    the names of the container.
+    Returns ffmpeg's log about the file, the log about the filters and the frame, and the container's names.
     """
     # "V" excludes cover pictures. Only the showinfo filter prints the exact frame rate.
     options = ("-map", "0:V:0", "-frames:v", "1", "-vf", f"{SQUARE_PIXELS},showinfo", "-f", "null", "-")

@@ -27,10 +27,7 @@ class ClosableQueue(Generic[Item]):
         self._error: BaseException | None = None
 
     def put(self, item: Item, *, replace: bool = False) -> None:
-        """Append an item when there is space, or in place of the others; raise the error of `abort`.
-
-        Without an error, an aborted queue raises `QueueClosed`.
-        """
+        """Append an item when there is space, or in place of the others; raise the error of `abort`."""
         with self._lock:
             if replace:
                 self._items.clear()

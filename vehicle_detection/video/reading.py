@@ -203,9 +203,8 @@ class FrameReader(Reader):
 def find_seek_time(path: Path | str, info: VideoInfo, wanted: float) -> float:
     """Return a time in the file from which ffmpeg decodes the frame at `wanted`, in seconds.
 
-    In files without an index, such as MPEG-TS, ffmpeg seeks to a position near the time, and decoding begins
-    with the next key frame, which may be seconds after it. Therefore the time of the first decoded frame is
-    checked.
+    In files without an index, such as MPEG-TS, decoding begins with the next key frame after it, perhaps
+    seconds later. Therefore the time of the first decoded frame is checked.
     """
     if not info.duration:  # raw streams have no times; ffmpeg's are wrong after a seek
         return info.video_offset
@@ -264,10 +263,7 @@ def _decode_errors(log: str) -> tuple[int, str]:
 
 
 def _announced_frames(path: Path | str, info: VideoInfo, end: int, *, exact: bool) -> int:
-    """Return the number of frames that a file announces; `end` if unknown, or if only rounding differs.
-
-    `exact` allows for no rounding.
-    """
+    """Return how many frames a file announces; `end` if unknown or, unless `exact`, about as many."""
     if info.frames <= end + (0 if exact else 1):
         return end
     # The file's duration is that of its longest stream, which may be the sound.
@@ -332,12 +328,9 @@ def frame_range(info: VideoInfo, start: float | None, end: float | None) -> tupl
 
 @dataclass(frozen=True, kw_only=True)
 class AudioSource:
-    """Sound for a written video.
+    """Sound for a written video."""
 
-    `input` holds ffmpeg's options that open it.
-    """
-
-    input: tuple[str, ...]
+    input: tuple[str, ...]  # options of ffmpeg that open it
     start: float = 0.0  # time (s) of the first written frame in the file
     audio_offset: float = 0.0  # time (s) in the file that is ffmpeg's time 0
     length: float | None = None  # maximum (s)

@@ -68,16 +68,13 @@ def _download_http(url: str, path: Path) -> None:
 
 
 def with_retries(request: Callable[[], Result]) -> Result:
-    """Call a function of remote storage again if it fails, up to three times in all.
-
-    Not all storages raise an OSError for a failed request.
-    """
+    """Call a function of remote storage again if it fails, up to three times in all."""
     for delay in _RETRY_DELAYS:
         try:
             return request()
         except _FINAL_ERRORS:
             raise
-        except Exception:
+        except Exception:  # not all storages raise an OSError
             time.sleep(delay)
     return request()
 

@@ -31,7 +31,7 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image
 from vehicle_detection.video.ffmpeg import NETWORK_TIMEOUT, input_options, source_name
 from vehicle_detection.video.files import IMAGE_SUFFIXES, check_file, is_video_file, list_files
-from vehicle_detection.video.live import LiveReader, LiveStream
+from vehicle_detection.video.live import LiveStream
 from vehicle_detection.video.probe import VideoInfo, probe
 from vehicle_detection.video.reading import (
     AudioSource,
@@ -145,8 +145,6 @@ class _ImageSequence(FrameSource):
 
 
 class _ImageReader(Reader):
-    """Reader of image files."""
-
     def __init__(self, info: VideoInfo, paths: Sequence[Path], first: int, count: int | None) -> None:
         self.info = info
         self._first = paths[0]
@@ -297,7 +295,7 @@ class _Stream(FrameSource):
         if self._read:
             raise InvalidInputError(f"source {self.name} can be read only once; open it again")
         self._read = True
-        return LiveReader(self._stream, drop=self.live, first=first, count=count)
+        return self._stream.start(drop=self.live, first=first, count=count)
 
 
 Source = str | os.PathLike[str] | int | Sequence[str | os.PathLike[str]] | FrameSource
@@ -475,8 +473,6 @@ def _download(url: str) -> FrameSource:
 
 def probe_video(path: str | os.PathLike[str]) -> VideoInfo:
     """Read the properties of a video file: frame size, exact frame rate, length, sound and rotation.
-
-    The number of frames is an estimate, because counting requires decoding the whole video.
 
     >>> probe_video("missing.mp4")
     Traceback (most recent call last):

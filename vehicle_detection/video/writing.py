@@ -120,10 +120,7 @@ class FrameWriter(Closing):
         self.frames_written += 1
 
     def finish(self, *, trim_sound: bool = False) -> None:
-        """Wait until ffmpeg has written the last frame, and all of the sound.
-
-        With `trim_sound`, for frames that end before the source does, the sound ends with them.
-        """
+        """Wait until ffmpeg has written the last frame, and the sound: all of it, or up to that frame."""
         if not self.frames_written:
             raise VideoError("no frame was read, so no video was written")
         self._process.stdin.close()
@@ -311,10 +308,9 @@ class _Drawing:
 
 
 class _Sink(Closing):
-    """Encodes pictures in a thread, which opens, and completes or removes, the file.
+    """Encodes pictures in a thread, which starts with the first one, and completes or removes the file.
 
-    Python raises KeyboardInterrupt in the main thread, where it must not interrupt the start of a process or
-    the removal of a file. The thread starts with the first picture.
+    Python raises KeyboardInterrupt in the main thread, where it must not interrupt this work.
     """
 
     def __init__(self, writer: AbstractContextManager[FrameWriter]) -> None:
