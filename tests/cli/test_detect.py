@@ -133,7 +133,6 @@ BAD_IMAGES = {
     "nothing.png": "nothing.png must be a complete image file",
     "tiny.png --model highway": "image of 12x12 pixels holds no search window",
     "{road} --horizon 2": "--horizon must be a number, at least 0 and at most 1; got 2",
-    "{road} --horizon nan": "--horizon must be a number, .* got nan",
     "{road} --conf 7": "--conf must be a number, at least 0 and at most 1; got 7",
     "{road} -o {material}": "--output .+ is the folder of road.png, which would be overwritten",
     "{road} -o {road}": "--output must be a folder",
@@ -143,9 +142,7 @@ BAD_IMAGES = {
     "{road} --line-width 0": "--line-width must be an integer from 1 to 1000; got 0",
     "{road} --boxes boxes.doc": "--boxes must end in .csv or .*, got 'boxes.doc'",
     "{road} --boxes none/boxes.csv": "--boxes needs an existing folder",
-    "{road} --model none.safetensors": "model file none.safetensors does not exist",
     "{road} --model motorway": "model file motorway does not exist; .* a shipped model: default, h",
-    "{road} --model {material}/empty": "model file .+empty is a folder",
     "{road} --model {material}/text.safetensors": "text.safetensors is not a complete safetensors",
 }
 if cv2.__version__ >= "5":  # OpenCV 4 converts floating-point numbers
@@ -178,6 +175,11 @@ def test_images_that_cannot_be_decoded_are_left_out(picture, material, tmp_path)
     assert contents(tmp_path / "found") == [picture.name]
     # A horizon that hides all vehicles is checked with the other images.
     assert run("detect", bad[0], picture, "--horizon", 0.95).exit_code == 3
+    small = tmp_path / "small.png"
+    write_image(small, np.zeros((20, 40, 3), np.uint8))
+    result = run("detect", small, picture, "--model", "highway")
+    assert result.exit_code == 3
+    assert f"warning: {small}: image of 40x20 pixels holds no search window" in result.stderr
 
 
 def test_no_image_that_can_be_decoded_prevents_the_table(material, tmp_path):
@@ -219,16 +221,6 @@ def test_detect_and_video_blur_vehicles(tmp_path):
             [np.abs(np.diff(picture[inside].mean(axis=2), axis=0)).max() for picture in pictures]
         )
     assert (np.array(contrasts[1]) < 0.5 * np.array(contrasts[0])).all()
-
-
-def test_images_that_are_too_small_are_left_out(tmp_path):
-    small, image = tmp_path / "small.png", tmp_path / "image.png"
-    write_image(small, np.zeros((20, 40, 3), np.uint8))
-    write_image(image, np.zeros((360, 640, 3), np.uint8))
-    result = run("detect", small, image, "--model", "highway")
-    assert result.exit_code == 3
-    assert f"warning: {small}: image of 40x20 pixels holds no search window" in result.stderr
-    assert str(small) in refuse("detect", small, "--model", "highway")
 
 
 def test_classes_of_a_network(picture, tmp_path):

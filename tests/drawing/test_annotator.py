@@ -182,8 +182,7 @@ class TestText:
         assert track_text(track(distance_std_m=6.0), ("distance",)) == "~24 m"
         unknown = track(distance_m=None, distance_std_m=None, speed_mps=None, speed_std_mps=None)
         assert track_text(unknown, LABEL_FIELDS) == "#1  1.2"
-
-    def test_the_own_speed_gives_speeds_over_ground(self):
+        # The own speed gives speeds over ground.
         assert track_text(track(), ("speed",), own_mps=25.0) == "84 km/h"
         assert track_text(track(speed_mps=-45.0), ("speed", "std"), "imperial", 25.0) == "45 ± 1 mph"
 
@@ -245,13 +244,11 @@ class TestPosition:
         assert position.distance_m == distance
         assert abs(position.lateral_m - lateral) < 0.35
 
-    def test_where_the_frame_truncates_the_near_end(self):
+    @pytest.mark.parametrize(("left", "sign"), [(790, 1), (0, -1)])
+    def test_where_the_frame_truncates_the_near_end(self, left, sign):
         """The visible far end of the side gives the position: here 4.5 m behind the near end, at 150 px."""
-        known = track((790, 380, 1280, 600), distance_m=4.0, distance_std_m=0.5)
-        position = road_position(known, CAMERA, SHAPE)
-        assert position.lateral_m == pytest.approx(0.150 * 8.5 + 0.9)
-        mirrored = track((0, 380, 490, 600), distance_m=4.0, distance_std_m=0.5)
-        assert road_position(mirrored, CAMERA, SHAPE).lateral_m == pytest.approx(-(0.150 * 8.5 + 0.9))
+        known = track((left, 380, left + 490, 600), distance_m=4.0, distance_std_m=0.5)
+        assert road_position(known, CAMERA, SHAPE).lateral_m == pytest.approx(sign * (0.150 * 8.5 + 0.9))
 
     def test_a_whole_box_of_a_fisheye_lens_is_not_truncated(self):
         camera = Camera.for_frame(SHAPE, lens="fisheye-120")
@@ -382,11 +379,10 @@ def test_every_track_and_detection_is_blurred(state):
 
 class TestDiagnostics:
     @pytest.mark.parametrize(("height", "width"), [(720, 1280), (361, 481), (1920, 1080), (4, 5)])
-    def test_has_the_shape_of_the_frame(self, height, width):
-        heat = np.zeros((height, width), np.float32)
-        mosaic = draw_diagnostics(blank(height, width), np.empty((0, 4)), heat, [])
-        assert mosaic.shape == (height, width, 3)
-        assert mosaic.dtype == np.uint8
+    def test_has_the_shape_of_the_frame_whatever_the_heat(self, height, width):
+        for heat in (np.zeros((height, width), np.float32), np.ones((90, 160), int), np.ones((9, 16), bool)):
+            mosaic = draw_diagnostics(blank(height, width), np.empty((0, 4)), heat, [])
+            assert (mosaic.shape, mosaic.dtype) == ((height, width, 3), np.uint8)
 
     def test_shows_frame_windows_heat_and_tracks(self):
         frame, heat = blank(), np.zeros((720, 1280))
@@ -407,10 +403,6 @@ class TestDiagnostics:
         expected = draw_diagnostics(image, [[5, 5, 30, 30]], heat, [])
         for frame in (np.asfortranarray(image), image[:, ::-1][:, ::-1]):
             np.testing.assert_array_equal(draw_diagnostics(frame, [[5, 5, 30, 30]], heat, []), expected)
-
-    def test_heat_may_be_smaller_empty_boolean_or_of_integers(self):
-        for heat in (np.zeros((90, 160)), np.ones((90, 160), int), np.ones((9, 16), bool), -np.ones((9, 16))):
-            assert draw_diagnostics(blank(), [], heat, []).shape == (720, 1280, 3)
 
 
 HEAT = np.zeros((720, 1280))
