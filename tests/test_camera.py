@@ -21,14 +21,6 @@ from vehicle_detection.errors import InvalidInputError
 CAMERA = Camera.for_frame(SHAPE)
 
 
-@pytest.mark.parametrize(("name", "remedy"), [("focal_px", "fov"), ("horizon_px", "horizon")])
-def test_for_frame_refuses_what_it_computes(name, remedy):
-    with pytest.raises(
-        InvalidInputError, match=f"{name} is not an argument of Camera.for_frame; pass {remedy}"
-    ):
-        Camera.for_frame(SHAPE, **{name: 300})
-
-
 def test_for_frame_places_horizon_and_focal_length():
     camera = Camera.for_frame((1000, 500, 3), horizon=0.4, fov=90.0, height_m=1.5)
     assert camera.focal_px == pytest.approx(500)
@@ -51,11 +43,8 @@ def test_pixel_errors_scale_with_the_focal_length():
     ("arguments", "message"),
     [
         ({"focal_px": 0.0}, "focal_px must be a number, greater than 0"),
-        ({"focal_px": math.nan}, "focal_px must be a number"),
         ({"horizon_px": math.inf}, "horizon_px must be a number"),
-        ({"height_m": -1.0}, "height_m must be a number, greater than 0"),
         ({"box_std": -0.1}, "box_std must be a number, at least 0"),
-        ({"focal_std": "1"}, "focal_std must be a number"),
     ],
 )
 def test_camera_rejects_invalid_values(arguments, message):
@@ -71,12 +60,9 @@ def test_camera_rejects_invalid_values(arguments, message):
         (SHAPE, {"fov": 180}, "fov must be a number, at least 1 and at most 170"),
         (SHAPE, {"zoom": 1.0}, "zoom is not an argument of Camera.for_frame"),
         (SHAPE, {"lens": "wide"}, "lens must be one of 'standard-58', 'wide-90', 'fisheye-120'"),
-        (
-            SHAPE,
-            {"fisheye": True, "k1": -0.9, "fov": 150},
-            "k1 and k2 must keep the radius positive",
-        ),
+        (SHAPE, {"fisheye": True, "k1": -0.9, "fov": 150}, "k1 and k2 must keep the radius positive"),
         (SHAPE, {"focal_px": 1.0}, "focal_px is not an argument.*pass fov"),
+        (SHAPE, {"horizon_px": 1.0}, "horizon_px is not an argument.*pass horizon"),
     ],
 )
 def test_for_frame_rejects_invalid_arguments(shape, known, message):

@@ -305,11 +305,6 @@ def test_a_given_heat_threshold_is_kept_and_checked_against_the_density():
         assert heat_range(search, WHOLE).high == np.inf
 
 
-def test_invalid_function_params_are_rejected():
-    with pytest.raises(InvalidInputError, match="min_score must be a number"):
-        FunctionParams(min_score=None)
-
-
 def test_everywhere_searches_all_rows():
     everywhere = SearchParams.default().everywhere()
     assert {(band.y1, band.y2) for band in everywhere.place((720, 1280))} == {(0, 720)}

@@ -39,10 +39,6 @@ def around(center, side, *, step=8, spread=2, peak=2.0):
     return Detections(boxes, scores)
 
 
-def concatenated(*parts):
-    return Detections(np.concatenate([p.boxes for p in parts]), np.concatenate([p.scores for p in parts]))
-
-
 def groups_of(boxes, peaks=None):
     boxes = np.array(boxes, float).reshape(-1, 4)
     peaks = np.full(len(boxes), 2.0) if peaks is None else np.array(peaks, float)
@@ -102,7 +98,7 @@ def test_windows_that_overlap_too_little_do_not_join():
 
 
 def test_two_vehicles_are_two_groups_best_first():
-    found = concatenated(around((400.0, 430.0), 90, peak=1.5), around((700.0, 430.0), 120, peak=2.5))
+    found = around((400.0, 430.0), 90, peak=1.5) + around((700.0, 430.0), 120, peak=2.5)
     groups = group_windows(found, PLAIN)
     assert len(groups) == 2
     assert (groups.boxes[:, 0] < 500).tolist() == [False, True]
@@ -120,7 +116,7 @@ def test_low_scores_and_single_windows_form_no_group():
 def test_windows_at_or_below_zero_are_ignored():
     good = around((640.0, 420.0), 96)
     bad = Detections(good.boxes + 20, -np.abs(good.scores))
-    with_bad = group_windows(concatenated(bad, good), PLAIN)
+    with_bad = group_windows(bad + good, PLAIN)
     alone = group_windows(good, PLAIN)
     np.testing.assert_array_equal(with_bad.boxes, alone.boxes)
     np.testing.assert_array_equal(with_bad.scores, alone.scores)
@@ -129,15 +125,7 @@ def test_windows_at_or_below_zero_are_ignored():
 def test_windows_without_area_are_ignored():
     flat = Detections([[10, 10, 10, 50], [10, 10, 50, 10], [5, 5, 5, 5]], [3.0, 3.0, 3.0])
     assert len(group_windows(flat, PLAIN)) == 0
-    assert len(group_windows(concatenated(flat, around((640.0, 420.0), 96)), PLAIN)) == 1
-
-
-def test_no_windows_give_no_groups():
-    groups = group_windows(Detections.empty(), DEFAULT)
-    assert groups.boxes.shape == (0, 4)
-    assert len(groups) == len(groups.scores) == 0
-    assert len(fit_boxes(groups, CAMERA, SHAPE, DEFAULT)) == 0
-    assert len(find_vehicles(Detections.empty(), CAMERA, SHAPE)) == 0
+    assert len(group_windows(flat + around((640.0, 420.0), 96), PLAIN)) == 1
 
 
 @given(any_windows())
@@ -181,14 +169,11 @@ def test_very_large_and_small_scores_do_not_overflow():
 
 
 def test_the_box_of_a_vehicle_straight_ahead_is_its_face():
-    found = fit_boxes(groups_of([window(640, 100, 450)]), CAMERA, SHAPE, PLAIN)
-    np.testing.assert_allclose(found.boxes, [[600, 417.5, 680, 492.5]])
-    assert found.scores.tolist() == [2.0]
-
-
-def test_width_and_height_of_a_window_scale_those_of_the_face():
-    found = fit_boxes(groups_of([[590, 420, 690, 480]]), CAMERA, SHAPE, PLAIN)
-    np.testing.assert_allclose(found.boxes, [[600, 430.5, 680, 475.5]])
+    square, low = window(640), [590, 420, 690, 480]
+    for box, face in ((square, [600, 417.5, 680, 492.5]), (low, [600, 430.5, 680, 475.5])):
+        found = fit_boxes(groups_of([box]), CAMERA, SHAPE, PLAIN)
+        np.testing.assert_allclose(found.boxes, [face])
+        assert found.scores.tolist() == [2.0]
 
 
 def test_the_box_of_a_vehicle_in_another_lane_includes_its_side():
@@ -289,7 +274,7 @@ def test_a_face_on_the_side_of_another_vehicle_is_dropped():
 
 
 def test_find_vehicles_groups_and_fits():
-    found = concatenated(around((400.0, 430.0), 90, peak=1.5), around((900.0, 430.0), 120, peak=2.5))
+    found = around((400.0, 430.0), 90, peak=1.5) + around((900.0, 430.0), 120, peak=2.5)
     both = find_vehicles(found, CAMERA, SHAPE, PLAIN)
     steps = fit_boxes(group_windows(found, PLAIN), CAMERA, SHAPE, PLAIN)
     np.testing.assert_array_equal(both.boxes, steps.boxes)
@@ -311,10 +296,10 @@ class TestDefaults:
     def test_windows_of_other_sizes_on_a_vehicle_form_no_second_group(self):
         small = around((420.0, 440.0), 64, step=6, peak=1.4)
         large = around((400.0, 430.0), 128, peak=2.5)
-        assert len(group_windows(concatenated(large, small), DEFAULT)) == 1
+        assert len(group_windows(large + small, DEFAULT)) == 1
 
     def test_neighbors_with_overlapping_windows_form_two_groups(self):
-        found = concatenated(around((400.0, 430.0), 100, spread=1), around((480.0, 430.0), 100, spread=1))
+        found = around((400.0, 430.0), 100, spread=1) + around((480.0, 430.0), 100, spread=1)
         assert len(group_windows(found, DEFAULT)) == 2
 
     def test_a_window_on_the_side_of_a_better_one_is_dropped(self):

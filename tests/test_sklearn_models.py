@@ -24,28 +24,26 @@ SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, ho
 
 
 @pytest.fixture(scope="module")
-def rendered():
-    return render_patches(80, random_state=1)
+def patches():
+    return render_patches(80, random_state=1)[0]
 
 
 @pytest.fixture(scope="module")
-def patches(rendered):
-    return rendered[0]
+def labels():
+    return render_patches(80, random_state=1)[1]
 
 
-@pytest.fixture(scope="module")
-def labels(rendered):
-    return rendered[1]
+def assert_same_scores(classifier, pipeline, rows):
+    """Up to the precision of float32."""
+    expected = pipeline.decision_function(rows)
+    np.testing.assert_allclose(classifier.decision_function(rows), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_from_an_own_pipeline(patches, labels):
     features = PatchFeatures(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
     pipeline = make_pipeline(features, StandardScaler(), LinearSVC(C=0.01, random_state=0))
     pipeline.fit(patches, labels.astype(bool))
-    classifier = VehicleClassifier.from_pipeline(pipeline, SMALL)
-    np.testing.assert_allclose(
-        classifier.decision_function(patches), pipeline.decision_function(patches), rtol=1e-4, atol=1e-4
-    )
+    assert_same_scores(VehicleClassifier.from_pipeline(pipeline, SMALL), pipeline, patches)
 
 
 @pytest.mark.parametrize("options", [{"with_mean": False}, {"with_std": False}])
@@ -53,10 +51,7 @@ def test_from_a_pipeline_without_mean_or_scale(patches, labels, options):
     rows = extract_features(patches, SMALL)
     pipeline = make_pipeline(StandardScaler(**options), LinearSVC(C=1e-3, random_state=0, max_iter=20_000))
     pipeline.fit(rows, labels)
-    classifier = VehicleClassifier.from_pipeline(pipeline, SMALL)
-    np.testing.assert_allclose(
-        classifier.decision_function(rows), pipeline.decision_function(rows), rtol=1e-4, atol=1e-4
-    )
+    assert_same_scores(VehicleClassifier.from_pipeline(pipeline, SMALL), pipeline, rows)
 
 
 def published_features(patches, size=8):
@@ -110,9 +105,7 @@ def test_a_grid_search_over_the_features(patches, labels):
     search = GridSearchCV(make_pipeline(*steps), grid, cv=2).fit(patches, labels)
     classifier = VehicleClassifier.from_pipeline(search)
     assert classifier.params == dataclasses.replace(SMALL, orient=5, spatial_order="interleaved")
-    np.testing.assert_allclose(
-        classifier.decision_function(patches), search.decision_function(patches), rtol=1e-4, atol=1e-4
-    )
+    assert_same_scores(classifier, search, patches)
     gained = dataclasses.replace(classifier.params, hist_gain=2)
     assert VehicleClassifier.from_pipeline(search, gained).params == gained
     with pytest.raises(InvalidInputError, match="params must equal those of the pipeline"):
@@ -124,19 +117,14 @@ def test_a_search_over_the_classifier_alone(patches, labels):
     search = GridSearchCV(LinearSVC(), {"C": [1e-3, 1e-2]}, cv=2)
     pipeline = Pipeline([("none", "passthrough"), ("scale", StandardScaler()), ("svm", search)])
     pipeline.fit(rows, labels)
-    classifier = VehicleClassifier.from_pipeline(pipeline, SMALL)
-    expected = pipeline.decision_function(rows)
-    np.testing.assert_allclose(classifier.decision_function(rows), expected, rtol=1e-4, atol=1e-4)
+    assert_same_scores(VehicleClassifier.from_pipeline(pipeline, SMALL), pipeline, rows)
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning")
 def test_a_classifier_that_searches_its_own_parameter(patches, labels):
     rows = StandardScaler().fit_transform(extract_features(patches, SMALL))
     fitted = LogisticRegressionCV(Cs=[1e-3, 1e-2], cv=2).fit(rows, labels)
-    classifier = VehicleClassifier.from_pipeline(fitted, SMALL)
-    np.testing.assert_allclose(
-        classifier.decision_function(rows), fitted.decision_function(rows), rtol=1e-4, atol=1e-4
-    )
+    assert_same_scores(VehicleClassifier.from_pipeline(fitted, SMALL), fitted, rows)
 
 
 class StandardScale(StandardScaler):
@@ -153,43 +141,33 @@ class Squared(LinearSVC):
 def test_pipelines_that_cannot_be_converted(patches, labels):
     rows = extract_features(patches, SMALL)
 
-    def take(pipeline):
-        return VehicleClassifier.from_pipeline(pipeline, SMALL)
+    def fit(*steps, rows=rows, labels=labels):
+        return make_pipeline(*steps).fit(rows, labels)
 
-    with pytest.raises(InvalidInputError, match="pipeline must be fitted; its LinearSVC is not"):
-        take(make_pipeline(LinearSVC()))
-    with pytest.raises(InvalidInputError, match="pipeline must be fitted; its StandardScaler is not"):
-        take(make_pipeline(StandardScaler(), LinearSVC()))
-    with pytest.raises(InvalidInputError, match="with refit=True; its GridSearchCV is not"):
-        take(GridSearchCV(LinearSVC(), {"C": [1]}))
-    with pytest.raises(InvalidInputError, match="must end in a linear classifier; got no step"):
-        take([])
-    with pytest.raises(InvalidInputError, match="must end in a linear classifier; got 3"):
-        take(3)
-    with pytest.raises(InvalidInputError, match="such as LinearSVC; got GaussianNB"):
-        take(make_pipeline(StandardScaler(), GaussianNB()).fit(rows, labels))
-    with pytest.raises(InvalidInputError, match="before the classifier; got StandardScale,"):
-        take(make_pipeline(StandardScale(), LinearSVC(C=1e-3)).fit(rows, labels))
-    with pytest.raises(InvalidInputError, match="before the classifier; got PCA"):
-        take(make_pipeline(PCA(4), LinearSVC()).fit(rows, labels))
-    with pytest.raises(InvalidInputError, match=r"train with MinMaxScaler\(clip=False\)"):
-        take(make_pipeline(MinMaxScaler(clip=True), LinearSVC()).fit(rows, labels))
-    with pytest.raises(InvalidInputError, match="weighted sum of the features; StandardScaler and Squared"):
-        take(make_pipeline(StandardScaler(), Squared()).fit(rows, labels))
-    with pytest.raises(InvalidInputError, match=r"must be the FeatureParams of .*; got None"):
-        VehicleClassifier.from_pipeline(make_pipeline(StandardScaler(), LinearSVC()).fit(rows, labels))
-    many = make_pipeline(StandardScaler(), LinearSVC(C=1e-5)).fit(rows, np.arange(80) % 3)
-    with pytest.raises(InvalidInputError, match=r"labels 0 or -1 for others and 1 for vehicles; got .*2"):
-        take(many)
-    other = make_pipeline(StandardScaler(), LinearSVC()).fit(rows, np.repeat(["car", "road"], 40))
-    with pytest.raises(InvalidInputError, match="must be fitted on the labels 0 or -1"):
-        take(other)
-    short = make_pipeline(StandardScaler(), LinearSVC()).fit(rows[:, :5], labels)
-    with pytest.raises(
-        InvalidInputError,
-        match=rf"on the {SMALL.length} features .*; its StandardScaler .* 5",
+    scaler = StandardScaler()
+    many, names = np.arange(80) % 3, np.repeat(["car", "road"], 40)
+    for pipeline, message in (
+        (make_pipeline(LinearSVC()), "pipeline must be fitted; its LinearSVC is not"),
+        (make_pipeline(StandardScaler(), LinearSVC()), "pipeline must be fitted; its StandardScaler is not"),
+        (GridSearchCV(LinearSVC(), {"C": [1]}), "with refit=True; its GridSearchCV is not"),
+        ([], "must end in a linear classifier; got no step"),
+        (3, "must end in a linear classifier; got 3"),
+        (fit(scaler, GaussianNB()), "such as LinearSVC; got GaussianNB"),
+        (fit(StandardScale(), LinearSVC(C=1e-3)), "before the classifier; got StandardScale,"),
+        (fit(PCA(4), LinearSVC()), "before the classifier; got PCA"),
+        (fit(MinMaxScaler(clip=True), LinearSVC()), r"train with MinMaxScaler\(clip=False\)"),
+        (fit(scaler, Squared()), "weighted sum of the features; StandardScaler and Squared"),
+        (fit(scaler, LinearSVC(C=1e-5), labels=many), "0 or -1 for others and 1 for vehicles; got .*2"),
+        (fit(scaler, LinearSVC(), labels=names), "must be fitted on the labels 0 or -1"),
+        (
+            fit(StandardScaler(), LinearSVC(), rows=rows[:, :5]),
+            rf"on the {SMALL.length} features .*; its StandardScaler .* 5",
+        ),
     ):
-        take(short)
+        with pytest.raises(InvalidInputError, match=message):
+            VehicleClassifier.from_pipeline(pipeline, SMALL)
+    with pytest.raises(InvalidInputError, match=r"must be the FeatureParams of .*; got None"):
+        VehicleClassifier.from_pipeline(fit(StandardScaler(), LinearSVC()))
 
 
 @pytest.mark.parametrize("scaler", [StandardScaler, RobustScaler, MinMaxScaler, MaxAbsScaler])

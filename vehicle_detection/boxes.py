@@ -307,8 +307,6 @@ def iou_matrix(first: Detections | ArrayLike, second: Detections | ArrayLike) ->
 
     The IoU of a box without area is 0, even with itself.
 
-    Examples
-    --------
     >>> iou_matrix([[0, 0, 10, 10]], [[0, 0, 10, 10], [5, 0, 15, 10], [20, 20, 30, 30]]).round(2)
     array([[1.  , 0.33, 0.  ]])
     """
@@ -322,8 +320,6 @@ def clip_boxes(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> NDArray
 
     A box outside the image collapses onto its border.
 
-    Examples
-    --------
     >>> clip_boxes([[-5, 10, 30, 60]], (50, 20, 3))
     array([[ 0, 10, 20, 50]])
     """
@@ -375,20 +371,10 @@ def non_max_suppression(
 ) -> NDArray[np.intp]:
     """Keep the best box of each group of overlapping boxes, greedily by score.
 
-    Parameters
-    ----------
-    boxes, scores
-        ``(N, 4)`` boxes, and ``(N,)`` numbers, higher is better.
-    threshold
-        IoU in [0, 1] above which the box with the lower score is dropped.
+    Boxes are ``(N, 4)`` and scores ``(N,)`` numbers, higher is better; the box with the lower score is
+    dropped if the IoU of two exceeds `threshold`. Returns the indices of the kept boxes, best score first;
+    equal scores keep their order.
 
-    Returns
-    -------
-    numpy.ndarray
-        Indices of the kept boxes, best score first; equal scores keep their order.
-
-    Examples
-    --------
     >>> non_max_suppression([[0, 0, 10, 10], [1, 0, 11, 10], [50, 0, 60, 10]], [0.5, 0.9, 0.1])
     array([1, 2])
     """

@@ -198,16 +198,10 @@ class Camera(Checked):
     ) -> Camera:
         """Return a dash-cam for frames of any size; what is not given is a guess with a large standard error.
 
-        Parameters
-        ----------
-        fov, lens
-            As in `for_frame`; a `fov` is that of a lens without distortion. If both are unknown, 58 degrees
-            with an error of 25%.
-        height_m, horizon
-            As in `for_frame`; by default 1.3, and in the middle, from where the tracker estimates it.
+        The arguments are those of `for_frame`; a `fov` is that of a lens without distortion. By default 58
+        degrees with an error of 25%, a height of 1.3 m, and a horizon in the middle, from where the tracker
+        estimates it.
 
-        Examples
-        --------
         >>> camera = Camera.dashcam(fov=90)
         >>> round(camera.for_shape((480, 640)).focal_px), camera.lens_is_known, camera.horizon_is_known
         (320, True, False)
@@ -359,16 +353,10 @@ def open_camera(
 ) -> Camera:
     """Return the camera that a user has stated, of which any part may be unknown.
 
-    Parameters
-    ----------
-    camera
-        A `Camera`, a file of `read_camera`, or the name of a lens, as in `Camera.for_frame`.
-    fov, height_m, horizon
-        As in `Camera.dashcam`; `fov` for an unknown lens, `height_m` also for a named one. `horizon` replaces
-        that of the camera.
+    `camera` is a `Camera`, a file of `read_camera`, or the name of a lens. The other arguments are those of
+    `Camera.dashcam`: `fov` for an unknown lens, `height_m` also for a named one; `horizon` replaces that of
+    the camera.
 
-    Examples
-    --------
     >>> open_camera("wide-90", horizon=0.55).horizon_px
     396.00000000000006
     """
@@ -391,17 +379,8 @@ def open_camera(
 
 
 def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int, ...] | None = None) -> None:
-    """Write a camera as a JSON file.
+    """Write a camera as a JSON file, in pixels of frames of `shape`, by default of its own shape.
 
-    Parameters
-    ----------
-    camera, path
-        The camera, and the file to write, .json.
-    shape
-        ``(height, width, ...)`` of the frames to which its pixels are scaled; by default its own shape.
-
-    Examples
-    --------
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "camera.json"
     >>> write_camera(Camera.for_frame((720, 1280), fov=90), file)
@@ -416,19 +395,13 @@ def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int,
 
 
 def read_camera(path: str | os.PathLike[str]) -> Camera:
-    """Read a camera from a JSON file, for frames of the aspect ratio of its ``image_size``, or of any.
+    """Read a camera from a JSON file, of `write_camera` or by hand, for its ``image_size`` or for any.
 
-    Parameters
-    ----------
-    path
-        A file of `write_camera`, or one written by hand. It is an object with attributes of `Camera`, all of
-        them optional. Instead of ``focal_px`` it may hold ``fov`` (degrees along the longer side) or ``lens``
-        (as in `Camera.for_frame`), and instead of ``horizon_px`` ``horizon`` (a fraction of the height). With
-        pixels it needs ``image_size``, ``[width, height]``. A lens or horizon that it lacks gets a large
-        standard error.
+    The file is an object with attributes of `Camera`, all of them optional. Instead of ``focal_px`` it may
+    hold ``fov`` (degrees along the longer side) or ``lens`` (as in `Camera.for_frame`), and instead of
+    ``horizon_px`` ``horizon`` (a fraction of the height). With pixels it needs ``image_size``, ``[width,
+    height]``. A lens or horizon that it lacks gets a large standard error.
 
-    Examples
-    --------
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "camera.json"
     >>> _ = file.write_text('{"fov": 120, "fisheye": true, "k1": 0.02, "height_m": 1.4}')

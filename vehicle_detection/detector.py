@@ -8,8 +8,7 @@ import threading
 import time as clock
 import warnings
 from collections.abc import Collection
-from pathlib import PurePath
-from typing import Any, ClassVar, Protocol, Self, overload
+from typing import Any, ClassVar, Protocol, Self, cast, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from vehicle_detection._common import (
     check_choice,
     check_image,
     check_number,
+    check_path,
     check_type,
     describe,
     pluralize,
@@ -92,11 +92,8 @@ def load_model(
     >>> load_model("highway").params.color_space
     'LAB'
     """
-    if not isinstance(path, (str, os.PathLike)):
-        raise InvalidInputError(
-            f"path must be a model file, 'default' or 'highway', got {describe(path)}; omit it for 'default'"
-        )
-    if str(path) == "default" or PurePath(os.fsdecode(path)).suffix.lower() in _NETWORK_SUFFIXES:
+    file = check_path(path, kind="a model file, 'default' or 'highway'")
+    if str(path) == "default" or file.suffix.lower() in _NETWORK_SUFFIXES:
         return load_network(os.fspath(path), classes=classes, device=device)
     check_choice(device, "device", ("cpu", "cuda"))
     for name, value in ("classes", classes), ("device", None if device == "cpu" else device):
@@ -124,8 +121,7 @@ def _check_model(model: Any) -> Model:
         raise InvalidInputError(
             f"model must be a name, a model file, or what load_model returns; got {describe(model)}; omit it"
         )
-    found: Model = model
-    return found
+    return cast(Model, model)
 
 
 class Detector(Closing):
@@ -260,17 +256,10 @@ class Detector(Closing):
     @overload
     def detect(self, image: list[Any]) -> list[Detections]: ...
     def detect(self, image: Image | Path | list[Any]) -> Detections | list[Detections]:
-        """Detect the vehicles of an image, or of each of several images.
+        """Detect the vehicles of an image, or of each of a list of images.
 
-        Parameters
-        ----------
-        image
-            ``(H, W, 3)`` uint8 RGB, or the path of an image file; or a list of these.
-
-        Returns
-        -------
-        Detections or list of Detections
-            Boxes in pixels of the image, with scores and, unless they come from a heat map, confidences.
+        An image is ``(H, W, 3)`` uint8 RGB, or the path of a file. The boxes, in pixels of the image, have
+        scores and, unless they come from a heat map, confidences.
         """
         if isinstance(image, list):
             return [self.detect(each) for each in image]
@@ -462,14 +451,9 @@ class VehicleDetector(Closing):
     ) -> FrameResult:
         """Update the tracks with the search result of the next frame, in frame order.
 
-        Parameters
-        ----------
-        found, time
-            Result of `search` for this frame, and its time in seconds, as in `process`.
-        frames
-            Number of frames since the last one, of which the others were not searched.
-        cut
-            Whether the frame begins another scene (`tracking.SceneCuts`), which ends all tracks.
+        `found` is the result of `search` for this frame, and `time` as in `process`. `frames` is the number
+        of frames since the last one, of which the others were not searched. A `cut` to another scene
+        (`tracking.SceneCuts`) ends all tracks.
         """
         check_type(found, "found", SearchResult, "pass what search returns")
         with self._one_thread:

@@ -73,19 +73,8 @@ def find_vehicles(
 ) -> Detections:
     """Group the positive windows of a frame and fit a box to each group.
 
-    Parameters
-    ----------
-    windows
-        Windows with scores; those at or below zero are ignored.
-    camera, shape
-        The camera, whose optical axis is the middle column, and ``(height, width, ...)`` of the frame.
-    params
-        Thresholds and geometry; by default ``RegionParams()``.
-
-    Returns
-    -------
-    Detections
-        Float boxes clipped to the frame; a box's score is the best score in its group.
+    `windows` have scores; those at or below zero are ignored. The optical axis of the camera is the middle
+    column of the frame. The boxes are clipped to the frame; a box's score is the best score in its group.
 
     Notes
     -----

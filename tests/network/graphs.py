@@ -39,7 +39,6 @@ def own_network(seed=0, *, size=("height", "width"), weights=None, params=None, 
         helper.make_node("Conv", ["planes", "kernel", "bias"], ["maps"], strides=[32, 32]),
         helper.make_node("Reshape", ["maps", "flat"], ["columns"]),
         helper.make_node("Split", ["columns", "parts"], ["centers", "sides", "logits"], axis=1),
-        helper.make_node("Shape", ["centers"], ["shape"]),
         # Centers: positions spread over the input by the number of the column.
         helper.make_node("Mul", ["centers", "spread"], ["moved"]),
         helper.make_node("Add", ["moved", "middle"], ["xy"]),
@@ -63,7 +62,7 @@ def own_network(seed=0, *, size=("height", "width"), weights=None, params=None, 
         ("middle", np.float32(160)),
     ]
     return serialize(
-        [node for node in nodes if node.op_type != "Shape"],
+        nodes,
         [("image", "uint8", [1, *size, 3])],
         [("boxes", "float32", [1, 5, "n"])],
         initializers,

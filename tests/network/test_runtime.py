@@ -77,13 +77,8 @@ def test_devices_and_runtimes(tmp_path, monkeypatch):
 
 def external(folder):
     model = onnx.load_from_string(own_network())
-    onnx.save(
-        model,
-        folder / "network.onnx",
-        save_as_external_data=True,
-        location="weights.bin",
-        size_threshold=0,
-    )
+    options = {"save_as_external_data": True, "location": "weights.bin", "size_threshold": 0}
+    onnx.save(model, folder / "network.onnx", **options)
     return (folder / "network.onnx").read_bytes()
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from tests.notebook.helpers import gray_image, titles
+from tests.notebook.helpers import gray_image, texts, titles
 from vehicle_detection.evaluation import Explanation
 from vehicle_detection.notebook import plot_explanation
 
@@ -27,11 +27,7 @@ def test_cells_and_terms_are_drawn():
     bars = figure.axes[2].patches
     assert [bar.get_x() for bar in bars] == pytest.approx([0, 0.75, 0.25])
     assert [bar.get_width() for bar in bars] == pytest.approx([0.75, -0.5, 0.2])
-    assert [label.get_text() for label in figure.axes[2].get_yticklabels()] == [
-        "cells",
-        "bias",
-        "color histogram",
-    ]
+    assert texts(figure.axes[2].get_yticklabels()) == ["cells", "bias", "color histogram"]
     # The line of the margin is behind the numbers.
     (line, *_), numbers = figure.axes[2].lines, figure.axes[2].texts
     assert all(number.get_bbox_patch() and number.get_zorder() > line.get_zorder() for number in numbers)

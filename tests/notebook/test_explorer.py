@@ -148,17 +148,6 @@ def test_windows_are_those_above_the_threshold(explorer):
         assert len(explorer.windows()) == (everything.scores > threshold).sum()
 
 
-def test_higher_thresholds_leave_fewer_boxes(explorer):
-    explorer.set_regions("heat", threshold=0.0)
-    many = len(explorer.boxes())
-    explorer.set_regions(threshold=1e6)
-    assert many > len(explorer.boxes()) == 0
-    explorer.set_regions("groups")
-    assert len(explorer.boxes()) > 0
-    explorer.set_regions(min_peak=100.0)
-    assert len(explorer.boxes()) == 0
-
-
 def test_bands_are_selected(explorer):
     explorer.set_search(min_score=-100.0)
     everything = explorer.windows()
@@ -341,13 +330,6 @@ def test_an_invalid_value_changes_nothing(explorer, method, arguments, refused):
     with pytest.raises(InvalidInputError, match=f"^{refused}"):
         getattr(explorer, method)(**arguments)
     assert (explorer._state, explorer.view, explorer.box) == before
-
-
-def test_malformed_options_are_those_of_the_detector(scenes):
-    with pytest.raises(InvalidInputError, match=r"^camera"):
-        Explorer(scenes, camera=1)
-    with pytest.raises(InvalidInputError, match=r"^width"):
-        Explorer(scenes, width=3)
 
 
 # The widgets

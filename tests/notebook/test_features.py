@@ -139,9 +139,8 @@ def test_weights_are_arranged_as_in_the_window():
         "HOG, positive", "HOG, negative", "spatial bins", "histogram", "in color",
     ]  # fmt: skip
     for channel, row in enumerate(grid):
-        np.testing.assert_array_equal(
-            row[2].images[0].get_array().ravel(), coef[channel * 64 : (channel + 1) * 64]
-        )
+        spatial = row[2].images[0].get_array().ravel()
+        np.testing.assert_array_equal(spatial, coef[channel * 64 : (channel + 1) * 64])
         start = 192 + 8 * channel
         np.testing.assert_array_equal(row[3].patches[0].get_data().values, coef[start : start + 8])
         # each orientation of each cell is either positive or negative

@@ -7,12 +7,6 @@ from vehicle_detection import notebook
 from vehicle_detection.boxes import Detections
 
 
-def test_every_public_name_is_exported():
-    assert sorted(notebook.__all__) == notebook.__all__
-    for name in notebook.__all__:
-        assert getattr(notebook, name).__name__ == name
-
-
 def test_figures_of_several_panels_are_not_managed_by_pyplot():
     figure = notebook.show_images([gray_image()])
     assert not plt.get_fignums()

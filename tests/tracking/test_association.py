@@ -80,23 +80,6 @@ def test_pairs_that_overlap_too_little_leave_their_boxes_to_others():
     assert match_boxes(predicted, measured, largest, min_iou=0.5) == [(1, 0)]
 
 
-def test_the_total_cost_is_least_although_a_single_pair_is_not():
-    # The nearest pair is (1, 0); it would leave the first track without a detection.
-    predicted, measured = boxes_at((50, 50), (80, 50)), boxes_at((75, 50), (105, 50))
-    assert match_boxes(predicted, measured, np.array([1.0, 1.0])) == [(0, 0), (1, 1)]
-
-
-def test_the_size_decides_between_boxes_at_one_place():
-    predicted = np.vstack([boxes_at((50, 50), side=40), boxes_at((50, 50), side=60)])
-    measured = np.vstack([boxes_at((50, 50), side=58), boxes_at((50, 50), side=42)])
-    assert match_boxes(predicted, measured, np.ones(2)) == [(0, 1), (1, 0)]
-
-
-def test_a_box_of_the_same_size_nearby_is_preferred_to_a_smaller_one_at_the_same_place():
-    predicted, measured = boxes_at((50, 50)), np.vstack([boxes_at((50, 50), side=28), boxes_at((60, 50))])
-    assert match_boxes(predicted, measured, np.ones(1)) == [(0, 1)]
-
-
 def cost(predicted, measured, limit):
     """Cost of a pair, and whether it is allowed."""
     distance = center_distances(predicted[None], measured[None])[0, 0] / limit

@@ -41,10 +41,8 @@ def test_first_distance_of_a_vehicle_is_that_of_the_pinhole_camera(distance):
 
 
 def test_truncated_edges_do_not_contribute_to_the_distance():
-    by_bottom, by_width = (
-        CAMERA.focal_px * CAMERA.height_m / (520 - CAMERA.horizon_px),
-        CAMERA.focal_px * CAMERA.vehicle_width_m / 160,
-    )
+    by_bottom = CAMERA.focal_px * CAMERA.height_m / (520 - CAMERA.horizon_px)
+    by_width = CAMERA.focal_px * CAMERA.vehicle_width_m / 160
     assert first_range([1100.0, 420, 1280, 520])[0] == pytest.approx(by_bottom)
     assert first_range([560.0, 420, 720, 720])[0] == pytest.approx(by_width)
     assert first_range([1100.0, 420, 1280, 720])[1] > 500

@@ -135,14 +135,11 @@ def least_squares(camera, boxes, seconds):
     width, height = (boxes[:, 2:] - boxes[:, :2]).T
     rows = np.hstack([np.ones((count, 1)), width[:, None], np.diag(width)])
     bottom_std, pitch_std = (
-        each * camera.pixel_scale for each in (camera.bottom_std_px, camera.pitch_std_px)
+        camera.bottom_std_px * camera.pixel_scale,
+        camera.pitch_std_px * camera.pixel_scale,
     )
-    variance = (
-        bottom_std**2
-        + (camera.box_std * height) ** 2
-        + 2 * slope**2 * (bottom_std**2 + (camera.box_std * width) ** 2)
-        + pitch_std**2
-    )
+    variance = bottom_std**2 + (camera.box_std * height) ** 2 + pitch_std**2
+    variance += 2 * slope**2 * (bottom_std**2 + (camera.box_std * width) ** 2)
     # The errors are correlated over half a second.
     weights = seconds / 0.5 / variance
     prior_std = [camera.horizon_std_px, slope * camera.height_std_m / camera.height_m]

@@ -10,18 +10,8 @@ SHAPE = (720, 1280, 3)
 
 
 def track(number, box, *, velocity=(0.0, 0.0), age=1.0, **options):
-    return Track(
-        id=number,
-        box=np.array(box, float),
-        score=1.0,
-        state="confirmed",
-        shown=True,
-        age=age,
-        misses=0,
-        time_since_update=0.0,
-        velocity=velocity,
-        **options,
-    )
+    known = {"score": 1.0, "state": "confirmed", "shown": True, "misses": 0, "time_since_update": 0.0}
+    return Track(id=number, box=np.array(box, float), velocity=velocity, age=age, **known, **options)
 
 
 def test_a_track_of_both_frames_is_interpolated():
@@ -42,9 +32,8 @@ def test_a_track_that_has_ended_moves_on():
     (found,) = interpolate_tracks([first], [], 0.04, 0.04, SHAPE)
     np.testing.assert_allclose(found.box, [102, 199, 152, 259])
     assert found.age == pytest.approx(2.04)
-    assert (
-        interpolate_tracks([track(1, [0, 200, 3, 260], velocity=(-100.0, 0.0))], [], 0.04, 0.04, SHAPE) == ()
-    )
+    leaving = track(1, [0, 200, 3, 260], velocity=(-100.0, 0.0))
+    assert interpolate_tracks([leaving], [], 0.04, 0.04, SHAPE) == ()
 
 
 def test_the_distance_of_a_track_that_has_ended_moves_on():
@@ -73,12 +62,8 @@ def test_tentative_tracks_are_interpolated_too():
     before = [replace(track(0, [left, 200, left + 50, 260], key=key), shown=False) for key, left in
               ((7, 100), (8, 300), (9, 500))]  # fmt: skip
     confirmed = track(2, [900, 200, 950, 260], key=1)
-    after = [
-        confirmed,
-        track(1, [504, 200, 554, 260], key=9),
-        before[0],
-        track(0, [0, 0, 9, 9], age=0.0, key=10),
-    ]
+    new = track(0, [0, 0, 9, 9], age=0.0, key=10)
+    after = [confirmed, track(1, [504, 200, 554, 260], key=9), before[0], new]
     found = interpolate_tracks([confirmed, *before], after, 0.04, 0.04, SHAPE)
     # Confirmed, confirmed in the second frame, tentative in both, and ended.
     assert [(each.id, each.key) for each in found] == [(2, 1), (1, 9), (0, 7), (0, 8)]

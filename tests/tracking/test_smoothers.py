@@ -6,12 +6,10 @@ import pytest
 from vehicle_detection.tracking import TrackParams
 from vehicle_detection.tracking.kalman import (
     HistorySmoother,
-    KalmanSmoother,
     KalmanStates,
     Measurements,
     NearestSmoother,
     centers_and_sizes,
-    make_smoother,
 )
 from vehicle_detection.tracking.track import TrackState
 
@@ -36,13 +34,6 @@ def follow(smoother, boxes, dt):
         states = smoother.correct(states, [track], Measurements.from_boxes(box[None], SHAPE), dt)
         found.append(states)
     return found
-
-
-@pytest.mark.parametrize(
-    ("name", "kind"), [("kalman", KalmanSmoother), ("history", HistorySmoother), ("nearest", NearestSmoother)]
-)
-def test_parameters_name_the_smoother(name, kind):
-    assert type(make_smoother(TrackParams(smoother=name))) is kind
 
 
 @pytest.mark.parametrize("kind", [HistorySmoother, NearestSmoother])

@@ -24,6 +24,14 @@ def found(*boxes, score=1.0):
     return Detections(np.array(boxes, float).reshape(-1, 4), np.full(len(boxes), float(score)))
 
 
+def after(frames, *boxes, score=1.0, **options):
+    """A tracker after this number of frames with these boxes, by default a car."""
+    tracker = Tracker(**options)
+    for _ in range(frames):
+        tracker.update(found(*boxes or (CAR,), score=score), SHAPE)
+    return tracker
+
+
 def on_road(distance, *, x=0.0, width=1.8, height=1.5, length=0.0):
     """Box of a vehicle `distance` meters ahead and `x` meters to the right; None behind the camera.
 
@@ -37,26 +45,14 @@ def on_road(distance, *, x=0.0, width=1.8, height=1.5, length=0.0):
     return np.array([640 + left, bottom - pixel * height, 640 + right, bottom])
 
 
-def play(
-    scene,
-    seconds,
-    *,
-    fps=25.0,
-    noise=0.05,
-    seed=0,
-    params=None,
-    undetected=None,
-    extra=None,
-    score=1.0,
-    camera=None,
-):
+def play(scene, seconds, *, fps=25.0, noise=0.05, seed=0, undetected=None, extra=None, **options):
     """Track a scene: `scene` maps names to boxes as functions of time; `undetected` suppresses detections.
 
     Detections are the visible parts, with noise on each edge inside the frame; vehicles of which less than a
     third is visible are not detected. Returns time, visible boxes by name, and tracks of each frame.
     """
     rng = np.random.default_rng(seed)
-    tracker, steps = Tracker(params, fps=fps, camera=camera), []
+    tracker, steps = Tracker(fps=fps, **options), []
     for index in range(round(seconds * fps)):
         time, truth, boxes = index / fps, {}, []
         for name, where in scene.items():
@@ -74,7 +70,7 @@ def play(
             noisy = inside + rng.normal(0, noise, 4) * size * (inside == box)
             boxes.append(np.clip(noisy, 0, LIMITS))
         boxes += extra(time) if extra else []
-        steps.append((time, truth, tracker.update(found(*boxes, score=score), SHAPE)))
+        steps.append((time, truth, tracker.update(found(*boxes), SHAPE)))
     return steps
 
 
@@ -128,10 +124,7 @@ class TestSmoothing:
         assert np.mean(overlaps) > 0.9
 
     def test_one_wrong_box_hardly_moves_the_track(self):
-        tracker = Tracker()
-        for _ in range(30):
-            tracker.update(found(CAR), SHAPE)
-        (track,) = tracker.update(found([560.0, 340.0, 760.0, 520.0]), SHAPE)
+        (track,) = after(30).update(found([560.0, 340.0, 760.0, 520.0]), SHAPE)
         assert np.abs(track.box - CAR).max() < 12
 
     def test_a_lane_change_after_a_long_straight_is_tracked(self):
@@ -145,9 +138,7 @@ class TestSmoothing:
 
     @pytest.mark.parametrize("fps", [10.0, 25.0, 60.0])
     def test_a_wrong_track_adapts_within_a_second(self, fps):
-        tracker, larger = Tracker(fps=fps), [570.0, 380.0, 720.0, 520.0]
-        for _ in range(int(2 * fps)):
-            tracker.update(found(CAR), SHAPE)
+        tracker, larger = after(int(2 * fps), fps=fps), [570.0, 380.0, 720.0, 520.0]
         for _ in range(int(0.7 * fps)):
             (track,) = tracker.update(found(larger), SHAPE)
         assert iou_matrix([larger], [track.box])[0, 0] > 0.85
@@ -193,12 +184,6 @@ class TestLifeCycle:
             shown += [track for track in tracker.update(noise, SHAPE) if track.shown]
         assert not shown
 
-    def test_a_strong_detection_is_shown_in_its_fourth_frame(self):
-        tracker = Tracker()
-        tracker.update(Detections.empty(), SHAPE)
-        shown = [any(t.shown for t in tracker.update(found(CAR, score=1.5), SHAPE)) for _ in range(6)]
-        assert shown == [False, False, False, True, True, True]
-
     def test_a_strong_detection_at_the_start_is_shown_at_once(self):
         tracker = Tracker()
         for ids_so_far in ([1], [2]):
@@ -229,18 +214,10 @@ class TestLifeCycle:
 
     @pytest.mark.parametrize(("score", "misses"), [(-0.4, 0), (-1.4, 0), (-1.6, 5)])
     def test_a_confirmed_track_is_continued_by_low_score_detections(self, score, misses):
-        tracker = Tracker()
-        for _ in range(10):
-            tracker.update(found(CAR, score=3.0), SHAPE)
+        tracker = after(10, score=3.0)
         for _ in range(5):
             (track,) = tracker.update(found(CAR, score=score), SHAPE)
         assert track.misses == misses
-
-    def test_low_score_detections_alone_are_never_shown(self):
-        for score in (-0.4, -1.0):
-            tracker = Tracker()
-            for _ in range(100):
-                assert not any(track.shown for track in tracker.update(found(CAR, score=score), SHAPE))
 
     def test_a_score_that_alternates_around_the_threshold_gives_a_track_without_gaps(self):
         tracker, shown = Tracker(), []
@@ -251,10 +228,8 @@ class TestLifeCycle:
         assert all(ids == [1] for ids in shown[25:])
 
     def test_a_low_score_detection_does_not_replace_a_high_score_one(self):
-        tracker, moved = Tracker(), [612.0, 400.0, 712.0, 490.0]
-        for _ in range(10):
-            tracker.update(found(CAR, score=3.0), SHAPE)
-        (track,) = tracker.update(Detections([CAR, moved], [-0.6, 3.0]), SHAPE)
+        moved = [612.0, 400.0, 712.0, 490.0]
+        (track,) = after(10, score=3.0).update(Detections([CAR, moved], [-0.6, 3.0]), SHAPE)
         assert track.score > 2
         assert track.box[0] > CAR[0] + 2
 
@@ -263,19 +238,14 @@ class TestLifeCycle:
         for shift, high, low in ((0.2, 0, 0), (0.5, 0, 1)):
             beside = np.array(CAR) + np.array([shift * width, 0, shift * width, 0])
             for score, misses in ((3.0, high), (-1.0, low)):
-                tracker = Tracker()
-                for _ in range(10):
-                    tracker.update(found(CAR, score=3.0), SHAPE)
-                tracks = tracker.update(found(beside, score=score), SHAPE)
+                tracks = after(10, score=3.0).update(found(beside, score=score), SHAPE)
                 assert tracks[0].misses == misses
 
     def test_a_low_score_detection_of_another_size_does_not_change_the_box(self):
         """Such as one around a car and the lamp post above it."""
         height = CAR[3] - CAR[1]
         for above, misses in ((0.5, 0), (1.4, 9)):
-            tracker = Tracker()
-            for _ in range(10):
-                tracker.update(found(CAR, score=3.0), SHAPE)
+            tracker = after(10, score=3.0)
             for _ in range(8):
                 tracker.update(found(), SHAPE)
             taller = np.array(CAR) - np.array([0, above * height, 0, 0])
@@ -316,9 +286,7 @@ class TestLifeCycle:
         assert states[11] == ("coasting", 1, 2)
 
     def test_a_vehicle_without_detections_is_shown_briefly_and_ends_later(self):
-        tracker = Tracker()
-        for _ in range(50):
-            tracker.update(found(CAR), SHAPE)
+        tracker = after(50)
         frames = [tracker.update(Detections.empty(), SHAPE) for _ in range(40)]
         shown = sum(any(t.shown for t in tracks) for tracks in frames)
         alive = sum(bool(tracks) for tracks in frames)
@@ -343,9 +311,7 @@ class TestLifeCycle:
         assert shown.index(True) + 1 == (3 if fps == 10 else 9)
 
     def test_a_briefly_detected_vehicle_coasts_only_briefly(self):
-        tracker = Tracker()
-        for _ in range(5):
-            tracker.update(found(CAR), SHAPE)
+        tracker = after(5)
         shown = sum(any(t.shown for t in tracker.update(Detections.empty(), SHAPE)) for _ in range(20))
         assert shown == 1
 
@@ -368,25 +334,18 @@ class TestLifeCycle:
             (track,) = tracker.update(Detections.empty(), SHAPE)
         assert 40 < track.box[0] - last.box[0] < 62
 
-    def test_two_boxes_on_one_vehicle_make_one_track(self):
-        nested, part = [620.0, 410.0, 670.0, 460.0], [600.0, 400.0, 660.0, 490.0]
-        tracker, shown = Tracker(), set()
-        for _ in range(50):
-            tracks = tracker.update(found(CAR, nested, part), SHAPE)
-            shown |= {track.id for track in tracks if track.shown}
-        assert shown == {1}
-
-    def test_a_later_second_box_on_a_vehicle_makes_no_second_track(self):
-        steps = play(
-            {"car": lambda t: on_road(15)}, 4, extra=lambda t: [np.array([600, 420, 670, 500.0])] * (t > 1)
-        )
-        assert shown_ids(steps) == {1}
-
-    def test_a_box_shifted_by_a_third_makes_no_second_track(self):
-        shifted = [635.0, 400.0, 735.0, 490.0]  # IoU 0.48, and neither covers 0.7 of the other
+    @pytest.mark.parametrize(
+        ("others", "start"),
+        [
+            ([[620.0, 410.0, 670.0, 460.0], [600.0, 400.0, 660.0, 490.0]], 0),
+            # IoU 0.48, and neither covers 0.7 of the other.
+            ([[635.0, 400.0, 735.0, 490.0]], 10),
+        ],
+    )
+    def test_several_boxes_on_one_vehicle_make_one_track(self, others, start):
         tracker, shown = Tracker(), set()
         for index in range(50):
-            tracks = tracker.update(found(CAR, *[shifted] * (index > 10)), SHAPE)
+            tracks = tracker.update(found(CAR, *others * (index >= start)), SHAPE)
             shown |= {track.id for track in tracks if track.shown}
         assert shown == {1}
 
@@ -403,9 +362,7 @@ class TestLifeCycle:
         assert len(seen) <= 3
 
     def test_several_tentative_tracks_are_continued_beside_a_confirmed_one(self):
-        tracker, others = Tracker(), [[100.0, 400, 180, 470], [900.0, 400, 980, 470]]
-        for _ in range(10):
-            tracker.update(found(CAR), SHAPE)
+        tracker, others = after(10), [[100.0, 400, 180, 470], [900.0, 400, 980, 470]]
         tracker.update(found(CAR, *others), SHAPE)
         car, *tentative = tracker.update(found(CAR, *others), SHAPE)
         assert (car.id, car.misses, car.key) == (1, 0, 1)
@@ -440,12 +397,8 @@ class TestLifeCycle:
         for shift in (0.0, threshold):
             params = TrackParams(score_time_constant=time_constant)
             tracker = Tracker(params=params, fps=10, calibration=Platt(-1.0, -shift))
-            seen.append(
-                [
-                    tracker.update(found(CAR, score=score - shift), SHAPE)[0].confidence
-                    for score in (3.0, 2.5, 4.0)
-                ]
-            )
+            updates = [tracker.update(found(CAR, score=score - shift), SHAPE) for score in (3.0, 2.5, 4.0)]
+            seen.append([track.confidence for (track,) in updates])
         np.testing.assert_allclose(*seen)
 
 
@@ -604,13 +557,6 @@ class TestTime:
         assert hidden - 4 == pytest.approx(0.3, abs=0.11)
         assert ended - 4 == pytest.approx(1.0, abs=0.11)
 
-    def test_velocity_is_in_pixels_per_second(self):
-        speeds = []
-        for fps in (10.0, 25.0, 60.0):
-            scene = {"car": lambda t: np.array(CAR) + np.array([60.0, 0, 60.0, 0]) * t}
-            speeds.append(play(scene, 3, fps=fps, noise=0.0)[-1][2][0].velocity[0])
-        assert speeds == pytest.approx([60, 60, 60], abs=3)
-
     def test_times_of_the_frames_replace_the_frame_rate(self):
         by_rate, by_time = Tracker(fps=50), Tracker(fps=25)
         for index in range(30):
@@ -652,20 +598,8 @@ class TestTime:
         assert seen == [[1], [1], [2]]
 
     def test_another_frame_size_ends_all_tracks(self):
-        tracker = Tracker()
-        for _ in range(10):
-            tracker.update(found(CAR), SHAPE)
-        (track,) = tracker.update(found(CAR), (1080, 1920, 3))
+        (track,) = after(10).update(found(CAR), (1080, 1920, 3))
         assert (track.id, track.age) == (0, 0.0)
-
-    def test_end_tracks_ends_all_tracks_and_ids_continue(self):
-        tracker = Tracker()
-        for _ in range(10):
-            tracker.update(found(CAR), SHAPE)
-        tracker.end_tracks()
-        for _ in range(10):
-            tracks = tracker.update(found(CAR), SHAPE)
-        assert [track.id for track in tracks] == [2]
 
     def test_reset_restores_the_initial_state(self):
         tracker = Tracker()
@@ -677,10 +611,7 @@ class TestTime:
         np.testing.assert_array_equal(runs[0][-1][0].box, runs[1][-1][0].box)
 
     def test_a_slow_frame_rate_is_no_gap(self):
-        tracker = Tracker(fps=0.8)
-        for _ in range(6):
-            tracks = tracker.update(found(CAR), SHAPE)
-        assert [track.id for track in tracks] == [1]
+        assert [track.id for track in after(5, fps=0.8).update(found(CAR), SHAPE)] == [1]
 
 
 class TestDistance:
@@ -711,12 +642,8 @@ class TestDistance:
             return 640 + factor * dx, 360 + factor * dy
 
         pixel = camera.focal_px / 18.0
-        left, right, bottom, top = (
-            640 + pixel * 2.7,
-            640 + pixel * 4.5,
-            360 + pixel * 1.3,
-            360 - pixel * 0.2,
-        )
+        left, right = 640 + pixel * 2.7, 640 + pixel * 4.5
+        bottom, top = 360 + pixel * 1.3, 360 - pixel * 0.2
         middle_x, middle_y = (left + right) / 2, (top + bottom) / 2
         box = (through_lens(left, middle_y)[0], through_lens(middle_x, top)[1])
         box += (through_lens(right, middle_y)[0], through_lens(middle_x, bottom)[1])
@@ -752,21 +679,17 @@ class TestDistance:
         Tracker(camera=dataclasses.replace(camera, shape=None)).update(found(CAR), (480, 640))
 
     def test_distance_is_unknown_where_nothing_can_be_measured(self):
-        tracker = Tracker(camera=CAMERA)
-        for _ in range(20):
-            (track,) = tracker.update(found([900.0, 420, 1280, 720]), SHAPE)
+        box = [900.0, 420, 1280, 720]
+        (track,) = after(19, box, camera=CAMERA).update(found(box), SHAPE)
         assert track.distance_m is track.distance_std_m is track.speed_mps is track.speed_std_mps is None
 
     def test_a_box_above_the_horizon_is_measured_by_its_width(self):
-        tracker = Tracker(camera=CAMERA)
-        for _ in range(30):
-            (track,) = tracker.update(found([600.0, 250, 700, 340]), SHAPE)
+        box = [600.0, 250, 700, 340]
+        (track,) = after(29, box, camera=CAMERA).update(found(box), SHAPE)
         assert track.distance_m is None or track.distance_m > 15
 
     def test_distance_is_unknown_after_coasting_long(self):
-        tracker = Tracker()
-        for _ in range(30):
-            tracker.update(found(CAR), SHAPE)
+        tracker = after(30)
         frames = [tracker.update(Detections.empty(), SHAPE)[0] for _ in range(20)]
         assert frames[0].distance_m is not None
         assert frames[-1].distance_m is None
@@ -799,13 +722,8 @@ class TestDistance:
 
     def test_a_given_camera_is_used(self):
         low, high = (Camera.for_frame(SHAPE, horizon=0.5, height_m=height) for height in (1.0, 2.0))
-        distances = []
-        for camera in (low, high):
-            tracker = Tracker(camera=camera)
-            for _ in range(50):
-                (track,) = tracker.update(found([600.0, 400, 700, 490]), SHAPE)
-            distances.append(track.distance_m)
-        assert distances[1] > distances[0] * 1.2
+        near, far = (after(49, camera=camera).update(found(CAR), SHAPE)[0] for camera in (low, high))
+        assert far.distance_m > near.distance_m * 1.2
 
 
 class TestPrediction:
@@ -853,11 +771,7 @@ class TestPrediction:
                 assert [track.id for track in predicted] == [track.id for track in second if track.id]
                 for track in predicted:
                     assert_valid(track)
-            assert [(t.id, t.age, t.misses, t.score, t.distance_m) for t in first] == [
-                (t.id, t.age, t.misses, t.score, t.distance_m) for t in second
-            ]
-            for left, right in zip(first, second, strict=True):
-                np.testing.assert_array_equal(left.box, right.box)
+            assert_equal(first, second)
 
     def test_a_prediction_is_what_the_next_frame_without_detection_returns(self):
         tracker = Tracker()
@@ -910,17 +824,7 @@ class TestDeterminism:
     @pytest.mark.parametrize("order", [0, 1, 2])
     def test_repeating_or_permuting_the_detections_changes_nothing(self, order):
         for first, second in zip(self.drive(0), self.drive(order), strict=True):
-            assert [(t.id, t.state, t.score, t.distance_m) for t in first] == [
-                (t.id, t.state, t.score, t.distance_m) for t in second
-            ]
-            for one, other in zip(first, second, strict=True):
-                np.testing.assert_array_equal(one.box, other.box)
-
-    def test_trackers_share_no_ids(self):
-        one, other = Tracker(), Tracker()
-        for _ in range(10):
-            first, second = one.update(found(CAR), SHAPE), other.update(found(CAR), SHAPE)
-        assert first[0].id == second[0].id == 1
+            assert_equal(first, second)
 
 
 class TestArguments:
@@ -938,9 +842,7 @@ class TestArguments:
             Tracker(camera=3)
 
     def test_rejects_malformed_frames_and_keeps_its_state(self):
-        tracker = Tracker()
-        for _ in range(10):
-            tracker.update(found(CAR), SHAPE)
+        tracker = after(10)
         with pytest.raises(
             InvalidInputError, match=r"detections must be a Detections, got .*pass Detections"
         ):
@@ -951,25 +853,6 @@ class TestArguments:
             tracker.update(found(CAR), SHAPE, time=math.nan)
         (track,) = tracker.update(found(CAR), SHAPE)
         assert (track.id, track.misses) == (1, 0)
-
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [
-            ({"smoother": "mean"}, "smoother must be one of 'kalman', 'history', 'nearest'"),
-            ({"score_time_constant": 0}, "score_time_constant must be a number, greater than 0"),
-            ({"confirm_hits": 0}, "confirm_hits must be an integer from 1"),
-            ({"confirm_seconds": -1}, "confirm_seconds must be a number, at least 0"),
-            ({"max_coast": 0.1}, "show_coast must be at most max_coast.*change both"),
-            ({"max_distance": math.nan}, "max_distance must be a number, greater than 0"),
-            ({"max_iou": 1.5}, "max_iou must be a number, at least 0 and at most 1"),
-            ({"measurement_noise": 0}, "measurement_noise must be a number, greater than 0"),
-            ({"nearest_weight": 0}, "nearest_weight must be a number, greater than 0"),
-            ({"high_threshold": "low"}, "high_threshold must be a number"),
-        ],
-    )
-    def test_params_reject_invalid_values(self, arguments, message):
-        with pytest.raises(InvalidInputError, match=message):
-            TrackParams(**arguments)
 
     def test_boxes_outside_the_frame_are_ignored(self):
         outside = found([1300.0, 400, 1400, 500], [-90.0, 10, -5, 60], [100.0, 100, 100, 200])
@@ -987,16 +870,6 @@ class TestArguments:
         for _ in range(5):
             tracks = tracker.update(Detections(np.array([[600, 400, 700, 490]]), np.array([1.0])), SHAPE)
         assert tracks[0].box.dtype == np.float64
-
-
-def test_a_track_that_moves_out_of_the_frame_ends_at_once():
-    tracker = Tracker(fps=25)
-    for frame in range(12):
-        left = 330.0 - 30 * frame
-        tracks = tracker.update(found([left, 380, left + 160, 480]), SHAPE)
-    assert tracks[0].shown
-    assert tracks[0].box[0] < 5
-    assert not any(track.shown for track in tracker.update(found(), SHAPE))
 
 
 def test_a_track_keeps_its_key_when_it_is_confirmed():
@@ -1026,12 +899,8 @@ def simulated_detections(truth, shape, *, seed, misses=0.1, clutter=0.3):
         boxes, scores = [], []
         for row in rows:
             box = np.array(row.box, float)
-            if (
-                box[2] - box[0] < 32 * pixel
-                or row.occluded_fraction > 0.5
-                or row.truncated > 0.65
-                or rng.random() < misses
-            ):
+            invisible = row.occluded_fraction > 0.5 or row.truncated > 0.65
+            if box[2] - box[0] < 32 * pixel or invisible or rng.random() < misses:
                 continue
             box += rng.normal(0, 3 * pixel, 4) * (box != limits) * (box != 0)
             boxes.append(np.clip(box, 0, limits))
@@ -1132,6 +1001,12 @@ def test_arbitrary_detections_give_valid_tracks(frames, smoother):
                 assert np.isfinite(cov).all()
                 if len(cov):
                     assert np.linalg.eigvalsh(cov).min() > -1e-3
+
+
+def assert_equal(first, second):
+    for one, other in zip(first, second, strict=True):
+        for field in dataclasses.fields(Track):
+            np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
 
 
 def assert_valid(track: Track) -> None:

@@ -12,13 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    Limit,
-    check_path,
-    check_sequence,
-    describe,
-    read_regular_file,
-)
+from vehicle_detection._common import Limit, check_path, check_sequence, describe, read_regular_file
 from vehicle_detection.boxes import logit
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.network.model import INPUT_SIZE, NetworkModel, NetworkParams

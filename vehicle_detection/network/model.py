@@ -38,8 +38,8 @@ class NetworkParams(Checked):
         Longer side of the network's input in pixels, a multiple of 32. Larger inputs show smaller vehicles
         and take more time. None: the size in the model file, 640 for the shipped network.
     min_score
-        Minimum score of the boxes before suppression that count as positive windows, in log-odds above the
-        model's threshold.
+        Minimum log-odds above the model's threshold of the boxes before suppression that are positive
+        windows.
 
     Examples
     --------
@@ -70,23 +70,18 @@ class NetworkModel(Checked):
 
     Attributes
     ----------
-    graph, name
-        Content of the ONNX file, and how messages refer to it.
+    graph, name, metadata
+        Content of the ONNX file, how messages refer to it, and the training facts or other metadata in it.
     input_format, output_format, input_size
-        How to make its input, and to decode its outputs; and longer side of its input, unless `NetworkParams`
-        has one.
+        How to make its input and to decode its outputs; longer side of its input, unless `NetworkParams` has
+        one.
     classes, class_ids
         Names of the classes by their numbers, None if they are unknown; and numbers of those to keep, None:
         all.
-    slope, offset
+    slope, offset, threshold, nms_iou
         Platt scaling: ``slope * logit(p) + offset`` is the log-odds that a box contains a vehicle, given its
-        probability in the network's output.
-    threshold, nms_iou
-        Minimum log-odds of a vehicle; and IoU above which the less probable box is dropped.
-    device, runtime
-        Where it runs, and the library that runs it.
-    metadata
-        Training facts stored in the file, or its ONNX metadata.
+        probability `p` in the network's output; minimum log-odds of a vehicle; and IoU above which the less
+        probable box is dropped.
 
     Examples
     --------

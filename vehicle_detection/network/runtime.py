@@ -58,12 +58,7 @@ class Session(Protocol):
 
 
 def open_session(
-    graph: bytes,
-    name: str,
-    *,
-    jobs: int | None = None,
-    device: Device = "cpu",
-    runtime: Runtime = "auto",
+    graph: bytes, name: str, *, jobs: int | None = None, device: Device = "cpu", runtime: Runtime = "auto"
 ) -> Session:
     """Make a graph ready to run on a device, with a number of threads that share one run.
 

@@ -248,18 +248,13 @@ class OutputFormat:
 
 @functools.lru_cache(maxsize=8)
 def _grid(size: Size) -> tuple[Floats, Floats]:
-    """Corners ``(N, 2)`` in cells, and strides ``(N,)``, of all cells of an input."""
+    """Corners ``(N, 2)`` in cells, and strides ``(N,)``, of all cells of strides 8, 16 and 32 of an input."""
     corners, strides = [], []
     for stride in (8, 16, 32):
         y, x = np.mgrid[: size[0] // stride, : size[1] // stride]
         corners.append(np.stack([x, y], axis=-1).reshape(-1, 2))
         strides.append(np.full(x.size, float(stride)))
     return np.concatenate(corners).astype(np.float64), np.concatenate(strides)
-
-
-def count_cells(size: Size) -> int:
-    """Return the number of cells of strides 8, 16 and 32 in an input of this height and width."""
-    return sum((size[0] // stride) * (size[1] // stride) for stride in (8, 16, 32))
 
 
 def recognize(
@@ -271,7 +266,7 @@ def recognize(
     """
     found = None
     if len(shapes) == 1 and len(shapes[0]) == 3 and shapes[0][0] == 1:
-        found = _recognize_one(shapes[0][1], shapes[0][2], count_cells(size), names)
+        found = _recognize_one(shapes[0][1], shapes[0][2], len(_grid(size)[1]), names)
     elif len(shapes) == 2 and all(len(shape) == 3 for shape in shapes):
         # The boxes of a network with 4 classes have the name.
         boxes = [i for i, shape in enumerate(shapes) if shape[2] == 4]

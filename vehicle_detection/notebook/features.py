@@ -198,17 +198,10 @@ def plot_hog(
     Each cell shows its block-normalized histogram, averaged over the blocks that contain the cell (Dalal and
     Triggs, CVPR 2005). Lines are parallel to the edges, that is, perpendicular to the gradients.
 
-    Parameters
-    ----------
-    images
-        One ``(H, W, 3)`` uint8 RGB image or several, such as a vehicle and a non-vehicle; the keys of a
-        mapping are the titles.
-    params, pix_per_cell
-        Color space, channels, orientations and block, by default ``FeatureParams()``; and cell sizes in
-        pixels, one row of panels each.
+    `images` is one ``(H, W, 3)`` uint8 RGB image or several, such as a vehicle and a non-vehicle; the keys of
+    a mapping are the titles. There is a row of panels for each cell size of `pix_per_cell`; `params` has the
+    color space, channels, orientations and block.
 
-    Examples
-    --------
     >>> patch = np.arange(64 * 64 * 3).reshape(64, 64, 3).astype(np.uint8)
     >>> len(plot_hog(patch, pix_per_cell=[8]).axes)
     6
@@ -337,8 +330,6 @@ def plot_weights(
     far as the model uses them; with spatial bins also the mean patch, shifted along the weights in both
     directions.
 
-    Examples
-    --------
     >>> from vehicle_detection import load_classifier
     >>> [panel.get_title() for panel in plot_weights(load_classifier()).axes[:2]]
     ['HOG, positive', 'HOG, negative']
@@ -432,8 +423,6 @@ def plot_explanation(
     for a vehicle and blue where it speaks against one, the stronger the more; and the terms of the margin
     with their sum.
 
-    Examples
-    --------
     >>> from vehicle_detection import VehicleDetector, explain
     >>> road = np.full((360, 640, 3), 90, np.uint8)
     >>> figure = plot_explanation(road, explain(VehicleDetector(), road, [300, 200, 360, 250]))

@@ -44,8 +44,6 @@ def describe_image(image: NDArray[Any]) -> ImageDescription:
 
     It tells, for example, a PNG that was read as floats from 0 to 1 from a JPEG of integers from 0 to 255.
 
-    Examples
-    --------
     >>> print(describe_image(np.full((2, 3, 3), 7, np.uint8)))
     uint8 array of shape (2, 3, 3), values 7 to 7, mean 7, 7, 7
     >>> describe_image(np.full((2, 3, 3), 0.5)).problem.partition("; ")[2]
@@ -127,8 +125,6 @@ def plot_methods(
     `methods` holds the detections in each image by the name of a method; `images` and `truth` are as in
     `show_images`.
 
-    Examples
-    --------
     >>> road = np.full((72, 128, 3), 90, np.uint8)
     >>> found = Detections([[10, 10, 30, 30]], [1.0])
     >>> figure = plot_methods([road], {"count": [Detections.empty()], "score": [found]})
@@ -213,8 +209,6 @@ def plot_patches(
 def plot_balance(patch_set: PatchSet, *, ax: Axes | None = None) -> Axes:
     """Plot the number of patches of each source and class, vehicles first, and the percentage of each class.
 
-    Examples
-    --------
     >>> names = ["vehicles/KITTI/1.png", "vehicles/KITTI/2.png", "non-vehicles/GTI/1.png"]
     >>> axes = plot_balance(PatchSet(np.zeros((3, 64, 64, 3), np.uint8), [1, 1, 0], names))
     >>> [text.get_text() for text in axes.get_yticklabels()]
@@ -257,19 +251,11 @@ def plot_near_duplicates(
 ) -> Axes:
     """Show pairs of near duplicates: each patch, and below it the patch that is most similar.
 
+    `pairs` are ``(M, 2)`` row numbers, as `find_near_duplicates` returns, of which at most `count` are shown,
+    chosen at even distances; with a `split`, only pairs of a test patch (above) and a training patch.
     Captions are the source, and the correlation of the two patches. The title states the percentage of (test)
     patches that have a near duplicate (in the training part).
 
-    Parameters
-    ----------
-    patch_set, pairs
-        The patches, and ``(M, 2)`` of their row numbers, as `find_near_duplicates` returns.
-    split, count
-        With a split, only pairs of a test patch (above) and a training patch are shown; and maximum number
-        of pairs, chosen at even distances if there are more.
-
-    Examples
-    --------
     >>> patches = np.random.default_rng(0).integers(0, 256, (4, 64, 64, 3), np.uint8)
     >>> patches[3] = patches[1] // 2
     >>> drawn = PatchSet(patches, [1, 1, 1, 1], [f"vehicles/drawn/{row}.png" for row in range(4)])

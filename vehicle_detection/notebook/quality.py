@@ -47,16 +47,9 @@ def plot_scores(
 ) -> Axes:
     """Plot histograms of the scores of both classes, on a logarithmic scale that makes errors visible.
 
-    Parameters
-    ----------
-    scores, labels
-        ``(N,)`` decision values, and ``(N,)`` 1 for a vehicle, 0 for anything else.
-    threshold, bins
-        Score above which a patch is classified as a vehicle: the vertical line, at which the legend counts
-        the errors; and number of bins over the range of the scores.
+    `labels` are 1 for a vehicle, 0 for anything else. Patches with scores above `threshold`, the vertical
+    line, are classified as vehicles; the legend counts the errors.
 
-    Examples
-    --------
     >>> axes = plot_scores([1.0, 2.0, -0.5, -2.0], [1, 1, 1, 0])
     >>> [text.get_text() for text in axes.get_legend().get_texts()]
     ['vehicles: 1 of 3 missed', 'other: 0 of 1 classified as vehicles', 'threshold 0']
@@ -106,8 +99,6 @@ def plot_precision_recall(
     `curves` is a result of `precision_recall_curve`, or a mapping from names to several; a square marks the
     `threshold`, a dot the best F1.
 
-    Examples
-    --------
     >>> curve = np.array([1.0, 0.5]), np.array([0.5, 0.5]), np.array([2.0, 0.5])
     >>> axes = plot_precision_recall({"road": curve})
     >>> axes.get_legend().get_texts()[0].get_text()
@@ -160,16 +151,10 @@ def plot_f1(
 ) -> Axes:
     """Plot a metric on each source of frames as bars, for one detector or several.
 
-    Parameters
-    ----------
-    scores
-        Results of `evaluate_detections` by source; or by detector, then by source. Unknown values have no
-        bar.
-    metric
-        ``"f1"``, ``"precision"``, ``"recall"``, ``"average_precision"`` or ``"mean_iou"``.
+    `scores` are results of `evaluate_detections` by source; or by detector, then by source. Unknown values
+    have no bar. `metric` is ``"f1"``, ``"precision"``, ``"recall"``, ``"average_precision"`` or
+    ``"mean_iou"``.
 
-    Examples
-    --------
     >>> from vehicle_detection import evaluate_detections
     >>> labels = TrackTable([0], None, [[0, 0, 50, 40]])
     >>> axes = plot_f1({"road": evaluate_detections(labels, labels)})
@@ -324,18 +309,11 @@ def plot_tradeoff(
 ) -> Axes:
     """Plot the quality of each configuration against its cost, with the Pareto front.
 
-    The first collection of the Axes holds all points, the first line the front (see `pareto_front`).
+    `table` holds results of `compare_configurations` or `search_parameters`. `quality` and `cost` are its
+    columns of the y axis, where higher is better, and of the x axis, where lower is better; `label` is that
+    of the text beside the points of the front. Rows without either value are left out. The first collection
+    of the Axes holds all points, the first line the front (see `pareto_front`).
 
-    Parameters
-    ----------
-    table
-        Results of `compare_configurations` or `search_parameters`; rows without either value are left out.
-    quality, cost, label
-        Columns of the y axis, where higher is better, of the x axis, where lower is better, and of the text
-        beside the points of the front, None for no text.
-
-    Examples
-    --------
     >>> import pandas as pd
     >>> table = pd.DataFrame({"accuracy": [0.98, 0.99], "search_ms": [4.0, 9.0]})
     >>> plot_tradeoff(table, label=None).get_xlabel()
@@ -379,20 +357,11 @@ def plot_parameter(
 ) -> Axes:
     """Plot the mean of a measurement against a parameter.
 
-    There is a line for each value of `by`, with the standard deviation over rows with the same `parameter`
-    and `by` as error bars. The x axis is logarithmic if its numbers span more than a factor of 20, and evenly
-    spaced if it holds text.
+    `parameter` and `quality` are the columns of both axes in a `table` as in `plot_tradeoff`. There is a line
+    for each value of the column `by`, such as ``"split"``, with the standard deviation over rows with the
+    same `parameter` and `by` as error bars. The x axis is logarithmic if its numbers span more than a factor
+    of 20, and evenly spaced if it holds text.
 
-    Parameters
-    ----------
-    table
-        As in `plot_tradeoff`; rows without the measurement are left out.
-    parameter, quality, by
-        Columns of the x axis, such as ``"C"``, of the y axis, a measurement, and of the groups of rows that
-        form lines, such as ``"split"``, None for one line.
-
-    Examples
-    --------
     >>> import pandas as pd
     >>> table = pd.DataFrame({"C": [1e-4, 1.0], "accuracy": [0.99, 0.98]})
     >>> plot_parameter(table, "C").get_xscale()

@@ -33,18 +33,10 @@ def plot_windows(
 ) -> Axes:
     """Draw windows on a frame, colored by score; the title is their number, unless it is given.
 
-    The first collection of the Axes holds the windows in ascending order of score, and their scores.
+    `windows` are `Detections`, as `find_cars` returns, or ``(N, 4)`` boxes without scores, as `slide_window`
+    returns, drawn in one color; `truth` are labelled boxes, drawn with dashed lines. The first collection of
+    the Axes holds the windows in ascending order of score, and their scores.
 
-    Parameters
-    ----------
-    image, windows
-        ``(H, W, 3)`` uint8 RGB; and `Detections`, as `find_cars` returns, or ``(N, 4)`` boxes without scores,
-        as `slide_window` returns, drawn in one color.
-    truth
-        Labelled boxes, drawn with dashed lines.
-
-    Examples
-    --------
     >>> found = Detections([[0, 0, 64, 64], [8, 0, 72, 64]], [1.5, 0.5])
     >>> axes = plot_windows(np.zeros((72, 128, 3), np.uint8), found)
     >>> axes.collections[0].get_array().tolist(), axes.get_title()
@@ -88,8 +80,6 @@ def plot_bands(
     collections are the bounds, the windows one step to the right and one step down, and the first window; the
     dashed line is the horizon.
 
-    Examples
-    --------
     >>> frame = np.zeros((720, 1280, 3), np.uint8)
     >>> figure = plot_bands(frame, SearchParams.preset("three-scales"))
     >>> len(figure.axes), figure.axes[1].get_title()
@@ -135,8 +125,6 @@ def plot_comparison(fast: ArrayLike, reference: ArrayLike, *, figure: FigureLike
 
     Beside the scatter plot is a histogram of the differences, whose title states the maximum.
 
-    Examples
-    --------
     >>> figure = plot_comparison([0.5, 1.0], [0.5, 1.25])
     >>> figure.axes[1].get_title()
     'maximum difference 0.25'
@@ -168,8 +156,6 @@ def plot_speedups(
 
     None for `reference` is the slowest method.
 
-    Examples
-    --------
     >>> axes = plot_speedups({"one by one": 4.0, "shared": 0.01})
     >>> [text.get_text() for text in axes.texts]
     ['4,000 ms', '10 ms, 400x faster']
@@ -212,18 +198,10 @@ def plot_heatmap(
 ) -> FigureLike:
     """Show how windows become boxes: the windows, their heat map, and the regions above the threshold.
 
-    The regions have different colors, and the boxes of `label_boxes` are one line collection.
+    The regions have different colors, and the boxes of `label_boxes` are one line collection. `params` are by
+    default as in `bounding_boxes`; `heat` is an ``(H, W)`` map, such as the mean over the last frames, by
+    default that of `windows`.
 
-    Parameters
-    ----------
-    image, windows
-        ``(H, W, 3)`` uint8 RGB frame, and its positive windows.
-    params, heat
-        Weighting, threshold and fraction of the peak, by default as in `bounding_boxes`; and ``(H, W)`` heat
-        map, such as the mean over the last frames, by default that of `windows`.
-
-    Examples
-    --------
     >>> frame = np.zeros((72, 128, 3), np.uint8)
     >>> found = Detections([[10, 10, 40, 40], [20, 10, 50, 40]], [1.5, 1.5])
     >>> figure = plot_heatmap(frame, found)

@@ -155,8 +155,6 @@ def plot_stage_times(runs: Run | Mapping[str, Run], *, ax: Axes | None = None) -
     `runs` is the report of `process_video`, or the detector's result of each frame; or several of them by
     name. Stages of a video run in parallel, so a bar may be longer than the time between two frames.
 
-    Examples
-    --------
     >>> result = FrameResult(0, 0.0, None, None, (), {"search": 0.012, "track": 0.002})
     >>> axes = plot_stage_times([result])
     >>> [text.get_text() for text in axes.get_legend().get_texts()]

@@ -133,13 +133,9 @@ class HorizonFilter:
 class HorizonEstimate:
     """Estimate of the horizon from the boxes of vehicles.
 
-    Attributes
-    ----------
-    horizon, horizon_std
-        Row of the horizon as a fraction of the frame's height, 0 at the top, and its standard error; treat
-        the estimate as a guess if it exceeds 0.05.
-    camera_height_m, n_boxes
-        Height of the camera above the road in meters, if vehicles are 1.5 m high; and number of boxes used.
+    The row of the horizon is a fraction of the frame's height, 0 at the top; treat it as a guess if its
+    standard error exceeds 0.05. The height of the camera above the road, in meters, assumes that vehicles are
+    1.5 m high.
     """
 
     horizon: float
@@ -151,19 +147,11 @@ class HorizonEstimate:
 def estimate_horizon(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> HorizonEstimate:
     """Estimate the height of the horizon from the boxes of vehicles, of one frame or of many.
 
-    The box's height is used, because its width includes the side of a vehicle in another lane. The height of
-    most cameras is roughly known (1.35 m, standard deviation 0.3 m), so that boxes of similar sizes suffice.
-    The line is fitted by iteratively reweighted least squares with Tukey's biweight, which ignores trucks and
-    false boxes (Beaton and Tukey, *Technometrics*, 1974).
+    At least 4 boxes must not be truncated. Their height is used, because the width includes the side of a
+    vehicle in another lane. The height of most cameras is roughly known (1.35 m, standard deviation 0.3 m),
+    so that boxes of similar sizes suffice. The line is fitted by iteratively reweighted least squares with
+    Tukey's biweight, which ignores trucks and false boxes (Beaton and Tukey, *Technometrics*, 1974).
 
-    Parameters
-    ----------
-    boxes, shape
-        ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, at least 4 of them not truncated; and ``(height, width, ...)``
-        of the frames.
-
-    Examples
-    --------
     >>> height = np.arange(40, 200, 10)
     >>> bottom = 396 + 0.9 * height
     >>> boxes = np.stack([600 - height / 2, bottom - height, 600 + height / 2, bottom], axis=1)

@@ -83,8 +83,8 @@ class Tracker:
     params, fps
         Thresholds, times and noise of the tracks; frames per second where `update` is called without a time.
     camera
-        The camera, for distances and speeds; by default `Camera.dashcam`. An uncertain horizon is estimated
-        from the vehicles.
+        For distances and speeds, by default `Camera.dashcam`. An uncertain horizon is estimated from the
+        vehicles.
     calibration
         Converts scores to the confidences of the tracks; by default scores are log-odds, and 0 is 50%. None
         leaves the confidences unknown.
@@ -207,8 +207,6 @@ class Tracker:
         then is left out. The smoothers ``"history"`` and ``"nearest"`` have no motion model and leave each
         box where it is.
 
-        Examples
-        --------
         >>> tracker = Tracker(fps=25)
         >>> for frame in range(50):
         ...     found = Detections([[600 + 4 * frame, 400, 700 + 4 * frame, 490]], [1.0])
@@ -445,8 +443,6 @@ def _clip(boxes: Floats, frame: FrameShape) -> Floats:
 class SceneCuts:
     """Finds the frames with which a new scene begins, given the frames of a video in their order.
 
-    Examples
-    --------
     >>> cuts, dark = SceneCuts(), np.zeros((90, 160, 3), np.uint8)
     >>> [cuts.update(frame) for frame in (dark, dark + 20, dark + 200, dark + 210)]
     [False, False, True, False]
