@@ -10,8 +10,7 @@ import functools
 import math
 import re
 from collections.abc import Hashable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -189,8 +188,7 @@ _INSIDE, _ELSEWHERE = 6, 99
 _DIGIT = re.compile(r"\d")
 
 
-@dataclass(frozen=True)
-class Label:
+class Label(NamedTuple):
     """A placed label."""
 
     lines: tuple[str, ...]
@@ -199,8 +197,7 @@ class Label:
     leader: tuple[tuple[int, int], tuple[int, int]] | None = None  # line from the box to the label
 
 
-@dataclass(frozen=True)
-class LabelRequest:
+class LabelRequest(NamedTuple):
     """A label to place: fields of text, at the box of a track with a constant key."""
 
     key: Hashable
@@ -292,11 +289,10 @@ def _free_place(
 def _least_hiding(places: Iterable[Place], obstacles: Sequence[Rectangle], last: int | None) -> Place:
     """Return the place that hides least, where the last one counts less."""
 
-    def cost(place: Place) -> tuple[float, int]:
-        number, rectangle = place
-        return _hidden_area(rectangle, obstacles) * (_LAST_WEIGHT if number == last else 1.0), number
+    def hidden(place: Place) -> float:
+        return _hidden_area(place[1], obstacles) * (_LAST_WEIGHT if place[0] == last else 1.0)
 
-    return min(places, key=cost)
+    return min(places, key=hidden)  # the first one of equals, the best
 
 
 def _places(box: Rectangle, size: tuple[int, int], shape: tuple[int, ...]) -> Iterator[Place]:
@@ -343,11 +339,11 @@ def _leader(box: Rectangle, label: Rectangle) -> tuple[tuple[int, int], tuple[in
 
 
 def _hidden_area(label: Rectangle, obstacles: Sequence[Rectangle]) -> int:
-    overlaps = (
-        (min(label[2], other[2]) - max(label[0], other[0]), min(label[3], other[3]) - max(label[1], other[1]))
-        for other in obstacles
-    )
-    return sum(max(width, 0) * max(height, 0) for width, height in overlaps)
+    area = 0
+    for x1, y1, x2, y2 in obstacles:
+        width, height = min(label[2], x2) - max(label[0], x1), min(label[3], y2) - max(label[1], y1)
+        area += max(width, 0) * max(height, 0)
+    return area
 
 
 def _intersect(first: Rectangle, second: Rectangle, space: int = 0) -> bool:

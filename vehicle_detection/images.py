@@ -96,25 +96,11 @@ def _is_truncated(data: bytes) -> bool:
 def read_image(path: str | os.PathLike[str] | bytes) -> NDArray[np.uint8]:
     """Read an image file as ``(H, W, 3)`` uint8 RGB, whatever its format.
 
-    Parameters
-    ----------
-    path
-        A PNG, JPEG, BMP, TIFF, WebP, GIF, PNM or JPEG 2000 file, or the content of one as ``bytes``. Gray,
-        RGBA and 16-bit files are converted, and the EXIF rotation is applied.
+    `path` is a PNG, JPEG, BMP, TIFF, WebP, GIF, PNM or JPEG 2000 file, or the content of one as ``bytes``.
+    Gray, RGBA and 16-bit files are converted, and the EXIF rotation is applied. A file that cannot be decoded
+    completely is an `InvalidInputError`, and so is one of more than 120 million pixels; the environment
+    variable ``VEHICLE_DETECTION_MAX_PIXELS`` sets another limit.
 
-    Returns
-    -------
-    numpy.ndarray
-        ``(H, W, 3)`` uint8 RGB, 0-255.
-
-    Raises
-    ------
-    InvalidInputError
-        If the file is missing, is a folder or a pipe, cannot be decoded completely, or has more than 120
-        million pixels; the environment variable ``VEHICLE_DETECTION_MAX_PIXELS`` sets another limit.
-
-    Examples
-    --------
     >>> read_image("missing.png")
     Traceback (most recent call last):
     ...
@@ -134,21 +120,9 @@ def read_image(path: str | os.PathLike[str] | bytes) -> NDArray[np.uint8]:
 
 
 def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
-    """Write an image file.
+    """Write an ``(H, W, 3)`` uint8 RGB image to a file, in the format of its suffix, such as ``.png``.
 
     The file is written atomically: after an error, an existing file is unchanged.
-
-    Parameters
-    ----------
-    path
-        The file; its suffix (``.png``, ``.jpg``, ...) sets the format.
-    image
-        ``(H, W, 3)`` uint8 RGB.
-
-    Raises
-    ------
-    InvalidInputError
-        If the image is malformed, the folder is missing or read-only, or the suffix is unknown.
     """
     rgb = check_image(image)
     check_path(path)

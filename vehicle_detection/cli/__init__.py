@@ -7,9 +7,7 @@ import gc
 import os
 import sys
 
-__all__ = [
-    "main",
-]
+__all__ = ["main"]
 
 
 def main() -> None:

@@ -19,7 +19,9 @@ from vehicle_detection.cli.options import flag, option, parse_classes, takes
 from vehicle_detection.cli.output import UNKNOWN_LENS, option_names, output_folder, print_error, print_line
 from vehicle_detection.errors import InvalidInputError
 
+# Options that have the names of the detector's and of `run_batch`.
 _DETECTOR_OPTIONS = "conf", "horizon", "camera", "fov", "camera_height", "every", "blur"
+_RUN_OPTIONS = "model", "jobs", "shard", "group", "tracks_only", "preset", "retry_failed", "dry_run"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,22 +120,16 @@ def _run(options: BatchOptions, sources: list[str]) -> Any:
         folder = local_path(options.output)
         if folder and not options.dry_run and not is_url(folder):
             stack.enter_context(output_folder(Path(folder), "--output"))
+        shown = not options.quiet
         return vd.run_batch(
             sources,
             options.output,
             executor,
-            model=options.model,
             options=options.detector_options(),
-            jobs=options.jobs,
-            shard=options.shard,
-            group=options.group,
-            tracks_only=options.tracks_only,
             audio=not options.no_audio,
-            preset=options.preset,
-            retry_failed=options.retry_failed,
-            dry_run=options.dry_run,
-            progress=not options.quiet,
-            on_record=functools.partial(_print_record, done=not options.quiet and not sys.stderr.isatty()),
+            progress=shown,
+            on_record=functools.partial(_print_record, done=shown and not sys.stderr.isatty()),
+            **{name: getattr(options, name) for name in _RUN_OPTIONS},
         )
 
 

@@ -15,13 +15,7 @@ from vehicle_detection.video.sources import (
     read_frames,
 )
 from vehicle_detection.video.viewer import Viewer, open_viewer
-from vehicle_detection.video.writing import (
-    PRESETS,
-    check_video_target,
-    cut_video,
-    process_video,
-    write_video,
-)
+from vehicle_detection.video.writing import PRESETS, check_video_target, cut_video, process_video, write_video
 
 __all__ = [
     "PRESETS",

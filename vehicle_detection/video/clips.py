@@ -33,10 +33,8 @@ def annotate_clip(
 
     Parameters
     ----------
-    clip
-        A video clip of moviepy 2.
-    detector
-        A `VehicleDetector`.
+    clip, detector
+        A video clip of moviepy 2, and a `VehicleDetector`.
     every
         Search every n-th frame, to save time; the tracks of the frames between are predicted.
     on_result

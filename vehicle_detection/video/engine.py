@@ -65,8 +65,7 @@ class VideoDetector(Protocol):
     def track(self, found: Any, /, *, time: float | None, frames: int, cut: bool) -> Any:
         """Update the tracks with a frame's search result, in frame order, and return the frame's result.
 
-        `frames` is 1 plus the number of frames before it that were not searched, and `cut` says whether it
-        begins another scene.
+        `frames` is 1 plus the number of unsearched frames before it; with `cut` it begins another scene.
         """
 
     def reset(self, *, fps: float) -> None:
@@ -77,30 +76,13 @@ class VideoDetector(Protocol):
 class VideoReport:
     """Counts and times of a run of `track` or `process_video`.
 
-    Attributes
-    ----------
-    frames, tracks
-        Numbers of frames, and of different tracks shown.
-    fps, shape
-        Exact frame rate of the video, and shape of a frame: ``(height, width, 3)``.
-    seconds
-        Elapsed time of the run.
-    stages
-        Seconds of work per stage, without waiting: ``"decode"``, ``"search"``, the detector's other stages,
-        ``"draw"`` and ``"encode"``. Decode and encode are processor time over all cores, the others elapsed
-        time. Stages run in parallel, so their sum may exceed `seconds`.
-    dropped
-        Number of frames of a live source that were dropped because the search was busy.
-    damage
-        What is damaged in the source, such as missing frames; empty if nothing is.
+    The stages are ``"decode"``, ``"search"``, the detector's other stages, ``"draw"`` and ``"encode"``.
+    Decode and encode are processor time over all cores, the others elapsed time, all without waiting. Stages
+    run in parallel, so their sum may exceed `seconds`.
 
-    Examples
-    --------
     >>> stages = {"decode": 1.0, "search": 3.0, "encode": 4.0}
-    >>> report = VideoReport(
-    ...     frames=250, fps=Fraction(25), shape=(720, 1280, 3), seconds=5.0, stages=stages, tracks=2
-    ... )
-    >>> print(report)
+    >>> shape = (720, 1280, 3)
+    >>> print(VideoReport(frames=250, fps=Fraction(25), shape=shape, seconds=5.0, stages=stages, tracks=2))
     250 frames of 1280x720 in 5.0 s: 50.0 frames/s, 2.0 times real time, 2 vehicles
     stage    ms/frame  fraction
     decode       4.00     12.5%
@@ -109,13 +91,13 @@ class VideoReport:
     """
 
     frames: int
-    fps: Fraction
-    shape: tuple[int, int, int]
-    seconds: float
-    stages: Mapping[str, float]
-    tracks: int
-    dropped: int = 0
-    damage: str = ""
+    fps: Fraction  # exact frame rate of the video
+    shape: tuple[int, int, int]  # of a frame: height, width and 3
+    seconds: float  # elapsed time
+    stages: Mapping[str, float]  # seconds of work
+    tracks: int  # number of different tracks shown
+    dropped: int = 0  # frames of a live source that were dropped because the search was busy
+    damage: str = ""  # what is damaged in the source, such as missing frames; empty if nothing is
 
     @property
     def frames_per_second(self) -> float:

@@ -183,12 +183,7 @@ class Process:
     """A running ffmpeg. Its log goes to a file, because a full pipe would block it."""
 
     def __init__(
-        self,
-        options: Sequence[str],
-        *,
-        level: str = "error",
-        stdin: bool | int = False,
-        stdout: bool = False,
+        self, options: Sequence[str], *, level: str = "error", stdin: bool | int = False, stdout: bool = False
     ) -> None:
         """Start ffmpeg; `stdin` is True for a pipe to it, or the descriptor of a file that it reads."""
         # In its own process group, so that Ctrl-C in the terminal reaches only Python, which ends ffmpeg. Not

@@ -62,18 +62,10 @@ class VideoInfo:
         Clockwise rotation in degrees from the stored frames to upright ones.
     start_time
         Time of the first frame in seconds after the file's start, if the sound starts earlier; otherwise 0.0.
-    pixel_format, container, color_encoding
-        ffmpeg's names, such as ``"yuv420p"`` and ``"matroska,webm"``, empty if unknown; and how luma and
-        chroma encode colors.
-    first_timestamp
-        Timestamp of the first frame in seconds, as stored in the file.
-    video_offset, audio_offset
-        ffmpeg's time 0 in seconds after the file's start, if it reads only that stream. It is the start of
-        the stream in MPEG-TS and similar containers, and 0.0 in others.
+    pixel_format, container
+        ffmpeg's names, such as ``"yuv420p"`` and ``"matroska,webm"``; empty if unknown.
     audio_track, audio_codec
         Index and codec (such as ``"aac"``) of the first audio track that can be decoded; None without one.
-    audio_format
-        Stream number, codec, rate and channels of that track, as ffmpeg prints them; empty without one.
 
     Examples
     --------
@@ -93,12 +85,14 @@ class VideoInfo:
     pixel_format: str = ""
     color_encoding: ColorEncoding = field(default_factory=ColorEncoding)
     container: str = ""
-    first_timestamp: float = 0.0
+    first_timestamp: float = 0.0  # of the first frame in seconds, as stored in the file
+    # ffmpeg's time 0 in seconds after the file's start, if it reads only that stream: the start of the stream
+    # in MPEG-TS and similar containers, 0 in others.
     video_offset: float = 0.0
     audio_offset: float = 0.0
     audio_track: int | None = None
     audio_codec: str | None = None
-    audio_format: tuple[str, ...] = ()
+    audio_format: tuple[str, ...] = ()  # stream number, codec, rate and channels, as ffmpeg prints them
 
     @property
     def has_audio(self) -> bool:

@@ -56,31 +56,18 @@ class FrameSource(Closing):
     A context manager, and an iterable of ``(index, time, frame)``: the frame's number from 0, its time in
     seconds, and an upright ``(H, W, 3)`` uint8 RGB array.
 
-    Attributes
-    ----------
-    name, info
-        What was opened, for messages, and properties of the video.
-    live, rereadable
-        Whether frames that are not read in time are dropped; whether it can be read more than once.
-    strict
-        Whether a damaged file is an error after its last frame, instead of a warning.
-    files
-        Files that are read, in order; empty for streams.
-
-    Examples
-    --------
-    >>> from vehicle_detection import open_source
     >>> with open_source("test_images/*.jpg", fps=10) as source:
     ...     print(source.info.frames, source.live, source.rereadable)
     6 False True
     """
 
-    live = False
-    rereadable = True
-    strict = False
+    live = False  # whether frames that are not read in time are dropped
+    rereadable = True  # whether it can be read more than once
+    strict = False  # whether a damaged file is an error after its last frame, instead of a warning
 
     def __init__(self, name: str, info: VideoInfo, files: Sequence[Path] = ()) -> None:
-        self.name, self.info, self.files = name, info, tuple(files)
+        self.name, self.info = name, info
+        self.files = tuple(files)  # that are read, in order; empty for streams
         self._on_close = contextlib.ExitStack()
 
     def __repr__(self) -> str:
