@@ -65,12 +65,16 @@ writing._Sink.put = pause
 """
 
 
+def start_paused(code, *words):
+    """Start a command that some code changes so that it prints "now" and waits."""
+    process = start_changed(code, *words)
+    assert process.stdout.readline() == "now\n", process.communicate()
+    return process
+
+
 def start_video(clip, folder):
     words = ["video", clip, "-o", folder / "out.mp4", "--tracks", folder / "out.csv", "--model", "highway"]
-    process = start_changed(PAUSED, *words)
-    line = process.stdout.readline()
-    assert line == "now\n", process.communicate()
-    return process
+    return start_paused(PAUSED, *words)
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
@@ -127,33 +131,29 @@ def test_an_early_interrupt_has_no_traceback(delay):
         "    return before\n"
         "signal.signal = note"
     )
-    process = start_changed(code, "info")
-    assert process.stdout.readline() == "now\n", process.communicate()
+    process = start_paused(code, "info")
     time.sleep(delay)
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    assert (process.returncode, errors) in ((130, "interrupted\n"), (0, ""))
+    status, _, errors = finish(process)
+    assert (status, errors) in ((130, "interrupted\n"), (0, ""))
 
 
 def test_an_interrupt_while_the_commands_are_imported():
-    code = (
-        "import os, signal, sys\n"
-        "class Interrupt:\n"
-        "    def find_spec(self, name, *rest):\n"
-        "        if name == 'typer':\n"
-        "            os.kill(os.getpid(), signal.SIGINT)\n"
-        "sys.meta_path.insert(0, Interrupt())"
-    )
-    process = start_changed(code)
-    assert process.communicate(timeout=60) == ("", "interrupted\n")
-    assert process.returncode == 130
+    code = """
+import os, signal, sys
+class Interrupt:
+    def find_spec(self, name, *rest):
+        if name == "typer":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupt())
+"""
+    assert finish(start_changed(code)) == (130, "", "interrupted\n")
 
 
 def test_an_interrupt_after_a_command_changes_nothing():
     code = "import atexit, os, signal; atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))"
-    process = start_changed(code, "info")
-    out, errors = process.communicate(timeout=60)
-    assert (process.returncode, errors) == (0, "")
+    status, out, errors = finish(start_changed(code, "info"))
+    assert (status, errors) == (0, "")
     assert out.startswith("default: ")
 
 
@@ -170,11 +170,9 @@ def train(*_, **__):
         executor.submit(time.sleep, 600).result()
 training.train_and_evaluate = train
 """
-    process = start_changed(code, "train", *patches_of(tmp_path), "-o", tmp_path / "x.safetensors")
-    assert process.stdout.readline() == "now\n", process.communicate()
+    process = start_paused(code, "train", *patches_of(tmp_path), "-o", tmp_path / "x.safetensors")
     process.send_signal(signal.SIGTERM)
-    _, errors = process.communicate(timeout=60)
-    assert (process.returncode, errors) == (143, "interrupted\n")
+    assert finish(process) == (143, "", "interrupted\n")
 
 
 def test_an_ignored_signal_stays_ignored():
@@ -307,11 +305,10 @@ import sys, time
 from vehicle_detection import drive
 drive.run_batch = lambda *_, **__: (print("now", flush=True), time.sleep(600))
 """
-    process = start_changed(code, "batch", clip, "-o", tmp_path / "new" / "out")
-    assert process.stdout.readline() == "now\n", process.communicate()
+    process = start_paused(code, "batch", clip, "-o", tmp_path / "new" / "out")
     assert contents(tmp_path) == ["new", "new/out"]
     process.send_signal(signal.SIGINT)
-    assert process.communicate(timeout=60)[1] == "interrupted\n"
+    assert finish(process) == (130, "", "interrupted\n")
     assert contents(tmp_path) == []
 
 

@@ -135,12 +135,11 @@ class _ImageReader(Reader):
     def __init__(self, info: VideoInfo, paths: Sequence[Path], first: int, count: int | None) -> None:
         self.info = info
         self._first = paths[0]
-        self._paths = list(enumerate(paths))[first : None if count is None else first + count]
+        chosen = list(enumerate(paths))[first : None if count is None else first + count]
+        self._files: Iterator[tuple[int, Path]] = iter(chosen)
 
     def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
-        if not self._paths:
-            raise StopIteration
-        index, path = self._paths.pop(0)
+        index, path = next(self._files)
         frame = read_image(path)
         if frame.shape != self.info.shape:
             raise InvalidInputError(
@@ -150,7 +149,7 @@ class _ImageReader(Reader):
         return index, float(index / self.info.fps), frame
 
     def kill(self) -> None:
-        self._paths = []
+        self._files = iter(())
 
 
 class _VideoSegments(FrameSource):
