@@ -98,10 +98,11 @@ def _check(options: VideoOptions) -> None:
     files = options.files()
     sources = {"SOURCE": Path(options.source)} | ({} if options.gpx is None else {"--gpx": options.gpx})
     check_distinct_paths(files, sources)
-    if options.tracks is not None:
-        check_suffix(options.tracks, "--tracks", tuple(FORMATS))
-    if options.report is not None:
-        check_suffix(options.report, "--report", (".html", ".htm"))
+    suffixes = {"--tracks": tuple(FORMATS), "--report": (".html", ".htm")}
+    suffixes |= {"--events": vd.drive.EVENT_SUFFIXES, "--srt": vd.drive.SUBTITLE_SUFFIXES}
+    for name, allowed in suffixes.items():
+        if (path := files[name]) is not None:
+            check_suffix(path, name, allowed)
     if options.output is None:
         for name, path, purpose in (
             ("--report", options.report, "contains it"),

@@ -49,16 +49,12 @@ class SideOutputs:
     """Files of ``video`` beside the video; their options are checked before the work starts."""
 
     def __init__(self, options: VideoOptions) -> None:
-        from vehicle_detection._common import check_choice, check_suffix
+        from vehicle_detection._common import check_choice
 
         self._options = options
         self._page: vd.ReportWriter | None = None
         self._table: vd.TrackTable
         self._events: tuple[vd.drive.Event, ...] = ()
-        if options.events is not None:
-            check_suffix(options.events, "--events", vd.drive.EVENT_SUFFIXES)
-        if options.srt is not None:
-            check_suffix(options.srt, "--srt", vd.drive.SUBTITLE_SUFFIXES)
         self._clip_kinds: list[str] = [*vd.drive.KINDS]
         if options.clips_of is not None:
             if options.clips is None:
