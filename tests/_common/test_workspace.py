@@ -10,33 +10,14 @@ from vehicle_detection._kernels.vector import float_block
 
 def test_arrays_of_one_name_share_the_memory_of_the_largest():
     workspace = Workspace()
-    large = workspace.take((40, 60, 3), np.uint8, "band")
-    large[:] = 7
-    for side in range(10, 40):
-        small = workspace.take((side, side, 3), np.uint8, "band")
-        assert small.shape == (side, side, 3)
-        assert small.flags.c_contiguous
-        assert np.shares_memory(small, large)
-    assert not np.shares_memory(workspace.take((40, 60, 3), np.uint8, "strip"), large)
-    assert not np.shares_memory(workspace.take((40, 60, 3), np.float32, "band"), large)
-    assert workspace.take((80, 60, 3), np.uint8, "band").shape == (80, 60, 3)
-
-
-def test_new_arrays_share_nothing():
-    first = NEW_ARRAYS.take((4, 6), np.float32, "band")
-    second = NEW_ARRAYS.take((4, 6), np.float32, "band")
-    assert first.shape == second.shape == (4, 6)
-    assert first.dtype == np.float32
-    assert not np.shares_memory(first, second)
-
-
-def test_views_are_of_the_largest_array():
-    workspace = Workspace()
     small = workspace.take((2, 3), np.float32, "a")
     assert workspace.take((2, 3), np.float32, "a") is small
     large = workspace.take((4, 3), np.float32, "a")
+    assert (large.shape, large.dtype, large.flags.c_contiguous) == ((4, 3), np.float32, True)
     assert np.shares_memory(workspace.take((2, 3), np.float32, "a"), large)
-    assert not np.shares_memory(workspace.take((2, 3), np.int32, "a"), large)
+    for dtype, name in ((np.float32, "b"), (np.int32, "a")):
+        assert not np.shares_memory(workspace.take((2, 3), dtype, name), large)
+    assert not np.shares_memory(*(NEW_ARRAYS.take((2, 3), np.float32, "a") for _ in range(2)))
     for number in range(5000):
         workspace.take((number % 12, 1), np.float32, str(number))
     assert np.shares_memory(workspace.take((2, 3), np.float32, "a"), large)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.drawing.cases import track
 from tools.browser import PHONE, Browser
 from vehicle_detection.annotator import Annotator
 from vehicle_detection.boxes import Detections
@@ -14,7 +15,7 @@ from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drive import ReportWriter
 from vehicle_detection.scenes import render_drive
-from vehicle_detection.tracking import FrameResult, Track
+from vehicle_detection.tracking import FrameResult
 from vehicle_detection.video import process_video
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="process groups and file names of POSIX")
@@ -46,21 +47,8 @@ class ScriptedDetector:
     def track(self, found, *, time, frames, cut):
         self.index += 1
         box = np.array([100.0 + self.index, 120, 180 + self.index, 180])
-        first = Track(
-            id=1,
-            box=box,
-            score=1.5,
-            state="confirmed",
-            shown=True,
-            age=1.0,
-            misses=0,
-            time_since_update=0.0,
-            velocity=(25.0, 0.0),
-            distance_m=20 + self.index / 10,
-            distance_std_m=2.0 if self.index < 45 else 8.0,
-            speed_mps=2.5,
-            speed_std_mps=0.5,
-        )
+        distance = {"distance_m": 20 + self.index / 10, "distance_std_m": 2.0 if self.index < 45 else 8.0}
+        first = track(id=1, box=box, speed_mps=2.5, speed_std_mps=0.5, **distance)
         second = replace(first, id=2, box=box + 150, distance_m=None, speed_mps=-1.0)
         tracks = (first, second) if 20 <= self.index < 40 else (first,)
         none = Detections.empty()

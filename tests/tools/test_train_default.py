@@ -11,12 +11,7 @@ from tests.training.networks import random_network
 from tools import rides, train_default
 from vehicle_detection.errors import DatasetError
 from vehicle_detection.network import load_network
-from vehicle_detection.training import (
-    NetworkTraining,
-    export_network,
-    rendered_source,
-    save_weights,
-)
+from vehicle_detection.training import NetworkTraining, export_network, rendered_source, save_weights
 
 
 @pytest.fixture

@@ -23,7 +23,6 @@ from vehicle_detection._common import (
     check_choice,
     check_flags,
     check_integer,
-    check_sequence,
     check_type,
     describe,
     hide_credentials,
@@ -67,6 +66,8 @@ from vehicle_detection.drive.worker_pool import WorkerPool
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video import PRESETS
 
+# What `BatchReport.planned` tells of a trip.
+_PLANNED = ("files", "camera", "start", "replaces")
 # Attempts at a trip whose worker is lost.
 _ATTEMPTS = 3
 # Files that are looked up at the same time: a server takes a while to answer for each.
@@ -204,30 +205,20 @@ def run_batch(
     check_flags(
         tracks_only=tracks_only, audio=audio, retry_failed=retry_failed, dry_run=dry_run, progress=progress
     )
-    if executor is not None and not hasattr(executor, "submit"):
-        raise InvalidInputError(
-            f"executor must be an executor of concurrent.futures, got {describe(executor)}; omit it"
-        )
-    if on_record is not None and not callable(on_record):
-        raise InvalidInputError(f"on_record must be a function of a record; got {describe(on_record)}")
-    if options is not None:
-        check_type(options, "options", Mapping, "pass a dictionary")
+    _check_callables(executor, on_record)
     workers = available_cores() if jobs is None else check_integer(jobs, "jobs", low=1, high=1024)
     check_choice(preset, "preset", PRESETS)
     if executor is None and not dry_run:
         import_pyarrow()  # an error now, not after the first trip
     settings = _settings(model, options, tracks_only=tracks_only, audio=audio, preset=preset)
-    single = isinstance(sources, (str, os.PathLike))
-    given = (sources,) if single else check_sequence(sources, "sources", "files, folders, patterns or URLs")
-    listed = list_videos(given)
+    listed = list_videos(sources)
     store = open_store(out, create=not dry_run, exists=not dry_run)
     tasks = _plan(listed, store, settings, group, part)
     pending, superseded = _pending(tasks, store, retry_failed)
     counts = Counter(skipped=len(tasks) - len(pending))
     planned, messages = None, {}
     if dry_run:
-        names = ("files", "camera", "start", "replaces")
-        planned = tuple({name: task[name] for name in names} for task in pending)
+        planned = tuple({name: task[name] for name in _PLANNED} for task in pending)
         pending, superseded, progress = [], [], False
     for task, record in superseded:
         remove_replaced(store, task, record)
@@ -246,15 +237,19 @@ def run_batch(
                 messages[made["sources"][0]["uri"]] = made["message"]
             if on_record is not None:
                 on_record(made)
-    return BatchReport(
-        **{name: counts[status] for name, status in COUNTS.items()},
-        trips=len(tasks),
-        skipped=counts["skipped"],
-        frames=counts["frames"],
-        seconds=time.perf_counter() - started,
-        messages=messages,
-        planned=planned,
-    )
+    numbers = {name: counts[status] for name, status in COUNTS.items()}
+    numbers |= {"trips": len(tasks), "skipped": counts["skipped"], "frames": counts["frames"]}
+    seconds = time.perf_counter() - started
+    return BatchReport(**numbers, seconds=seconds, messages=messages, planned=planned)
+
+
+def _check_callables(executor: object, on_record: object) -> None:
+    if executor is not None and not hasattr(executor, "submit"):
+        raise InvalidInputError(
+            f"executor must be an executor of concurrent.futures, got {describe(executor)}; omit it"
+        )
+    if on_record is not None and not callable(on_record):
+        raise InvalidInputError(f"on_record must be a function of a record; got {describe(on_record)}")
 
 
 def _parse_shard(shard: object) -> tuple[int, int]:
@@ -278,6 +273,7 @@ def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -
     name = os.fspath(model)
     if not shipped_model(name).is_file() and Path(name).exists():
         name = os.path.abspath(name)
+    check_type(options, "options", Mapping | None, "pass a dictionary")
     given = dict(options or {})
     for key, value in given.items():  # a path or a number of NumPy
         if isinstance(value, (os.PathLike, np.generic)):

@@ -18,6 +18,7 @@ from vehicle_detection import __version__
 from vehicle_detection._common import (
     available_cores,
     check_path,
+    check_sequence,
     describe,
     hide_credentials,
     is_hidden,
@@ -38,10 +39,12 @@ Facts = Mapping[str, Any]
 """What storage states about a file when it lists it, such as its size and entity tag; empty if unknown."""
 
 
-def list_videos(sources: Iterable[str | os.PathLike[str]]) -> dict[str, Facts]:
+def list_videos(sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> dict[str, Facts]:
     """Expand files, folders, patterns and URLs to absolute paths and URLs, sorted, each once."""
     found: dict[str, Facts] = {}
-    for source in sources:
+    single = isinstance(sources, (str, os.PathLike))
+    given = (sources,) if single else check_sequence(sources, "sources", "files, folders, patterns or URLs")
+    for source in given:
         if not isinstance(source, (str, os.PathLike)):
             raise InvalidInputError(
                 f"sources must be files, folders, patterns or URLs, got {describe(source)}; pass strings"

@@ -54,11 +54,9 @@ def open_store(out: str | os.PathLike[str], *, create: bool = False, exists: boo
 
     Without `exists`, a missing folder is like an empty one.
     """
-    if not isinstance(out, (str, os.PathLike)):
-        raise InvalidInputError(f"out must be a folder or a URL, got {describe(out)}; pass its path")
-    text = local_path(os.fsdecode(out))
+    text = local_path(os.fsdecode(out)) if isinstance(out, (str, os.PathLike)) else ""
     if not text:
-        raise InvalidInputError("out must be a folder or a URL, got ''; pass its path")
+        raise InvalidInputError(f"out must be a folder or a URL, got {describe(out)}; pass its path")
     if is_url(text):
         return Store(text.rstrip("/"))
     folder = Path(os.path.abspath(check_path(text, "out", kind="a folder or a URL")))
@@ -275,12 +273,6 @@ def with_source(source: str, message: str) -> str:
 def record_path(key: str) -> str:
     """Path of the record of a trip in its store."""
     return f"{_FOLDER}/{key}.json"
-
-
-def read_record(store: Store, key: str) -> dict[str, Any] | None:
-    """Read the record of a trip; None if there is none, or if it is damaged."""
-    data = store.read(record_path(key))
-    return None if data is None else _parse(data)
 
 
 def read_records(store: Store, keys: Iterable[str] | None = None) -> dict[str, dict[str, Any]]:

@@ -34,7 +34,6 @@ from vehicle_detection.drive.batch_store import (
     Store,
     is_complete,
     open_store,
-    read_record,
     read_records,
     record_path,
     write_record,
@@ -113,7 +112,7 @@ def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
     with store.lock(key.partition("-")[0]) as locked:
         if not locked:
             return {"key": key, "status": BUSY, "sources": task["sources"]}
-        record = read_record(store, key)
+        record = read_records(store, [key]).get(key)
         if record is not None and is_complete(record, store.exists) and not task.get("again"):
             return record | {"new": False}
         started = time.time()

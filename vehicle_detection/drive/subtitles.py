@@ -108,8 +108,7 @@ def write_subtitles(
     check_type(table, "table", TrackTable, "append the results of process_video to one")
     target = check_suffix(path, "path", SUBTITLE_SUFFIXES)
     rate = check_number(fps, "fps", above=0, high=1e6)
-    if own_speed is not None:
-        check_type(own_speed, "own_speed", OwnSpeed, "pass what read_own_speed returns")
+    check_type(own_speed, "own_speed", OwnSpeed | None, "pass what read_own_speed returns")
     check_choice(units, "units", UNITS)
     listed = check_events(events)
     cues = list(_merge(_second_texts(table, rate, listed, own_speed, UNITS[units])))

@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Checked, check_integer, check_sequence, choice, describe, number
+from vehicle_detection._common import Checked, check_integer, check_sequence, check_type, choice, number
 from vehicle_detection.camera import Camera
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes.bodywork import VehicleBody
 from vehicle_detection.scenes.camera_light import SceneConfig, SceneView, Sensor
 from vehicle_detection.scenes.raster import Image, Rng
@@ -140,11 +139,8 @@ def render_scene(
         vehicles = _random_vehicles(road, check_integer(vehicles, "vehicles", low=0, high=60), rng)
     poses = []
     for track, vehicle in enumerate(check_sequence(vehicles, "vehicles", "SceneVehicle"), start=1):
-        if not isinstance(vehicle, SceneVehicle):
-            raise InvalidInputError(
-                f"vehicles[{track - 1}] must be a SceneVehicle, got {describe(vehicle)}; "
-                "make one with SceneVehicle(distance_m=20)"
-            )
+        remedy = "make one with SceneVehicle(distance_m=20)"
+        check_type(vehicle, f"vehicles[{track - 1}]", SceneVehicle, remedy)
         # A generator for each vehicle: adding or removing a vehicle does not change the appearance of others.
         look = random_appearance(np.random.default_rng([config.seed, 5, track]))
         look |= {"kind": vehicle.kind or look["kind"], "color": vehicle.color or look["color"]}
