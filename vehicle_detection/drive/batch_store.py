@@ -49,7 +49,7 @@ _SUMMARY_COLUMNS = (
 )  # fmt: skip
 
 
-def open_store(out: str | os.PathLike[str], *, create: bool = False, exists: bool = True) -> Store:
+def open_store(out: object, *, create: bool = False, exists: bool = True) -> Store:
     """Open the folder or URL of a batch; with `create`, make the folder, which otherwise must exist.
 
     Without `exists`, a missing folder is like an empty one.
