@@ -13,33 +13,18 @@ from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 class Limit(Enum):
     """A limit: its environment variable, its default, and its unit."""
 
+    # Of an image or a video's frame, as stated in the header: checked before decoding.
     PIXELS = "VEHICLE_DETECTION_MAX_PIXELS", 120_000_000, "pixels"
-    """Pixels of an image or of a video's frame, as stated in the header: checked before decoding."""
-
     MODEL_BYTES = "VEHICLE_DETECTION_MAX_MODEL_BYTES", 256_000_000, "bytes"
-    """Size of a model file."""
-
     NETWORK_BYTES = "VEHICLE_DETECTION_MAX_NETWORK_BYTES", 1_000_000_000, "bytes"
-    """Size of a network's file, which may be that of a large detector."""
-
-    TEXT_BYTES = "VEHICLE_DETECTION_MAX_TEXT_BYTES", 1_000_000_000, "bytes"
-    """Size of a file of labels or predictions."""
-
-    RECORD_BYTES = "VEHICLE_DETECTION_MAX_RECORD_BYTES", 100_000_000, "bytes"
-    """Size of a GPX track or a table of speeds."""
-
-    IMAGE_BYTES = "VEHICLE_DETECTION_MAX_IMAGE_BYTES", 500_000_000, "bytes"
-    """Size of an image file, and of a member of a zip archive after unpacking."""
+    TEXT_BYTES = "VEHICLE_DETECTION_MAX_TEXT_BYTES", 1_000_000_000, "bytes"  # labels or predictions
+    RECORD_BYTES = "VEHICLE_DETECTION_MAX_RECORD_BYTES", 100_000_000, "bytes"  # a record of the own speed
+    IMAGE_BYTES = "VEHICLE_DETECTION_MAX_IMAGE_BYTES", 500_000_000, "bytes"  # also in an archive, unpacked
 
     @property
     def variable(self) -> str:
         """Name of the environment variable."""
         return str(self.value[0])
-
-    @property
-    def unit(self) -> str:
-        """What is counted."""
-        return str(self.value[2])
 
     def current(self) -> int:
         """Value of the environment variable, else the default."""
@@ -48,7 +33,7 @@ class Limit(Enum):
             return int(self.value[1])
         if not text.isascii() or not text.isdecimal() or len(text) > 16 or not 1 <= int(text) <= 10**15:
             raise InvalidInputError(
-                f"{self.variable} must be a number of {self.unit}, at least 1; got {text!r}"
+                f"{self.variable} must be a number of {self.value[2]}, at least 1; got {text!r}"
             )
         return int(text)
 
