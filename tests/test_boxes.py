@@ -170,9 +170,6 @@ def test_detections_are_columns():
     assert found[[1, 0]].scores.tolist() == [2, 1]
     assert len(found[[]]) == 0
 
-
-def test_an_index_takes_one_detection():
-    found = Detections([[0, 0, 10, 10], [5, 5, 9, 9]], [1, 2])
     for index in (1, -1, np.int64(1)):
         assert (found[index].boxes.tolist(), found[index].scores.tolist()) == ([[5, 5, 9, 9]], [2.0])
     with pytest.raises(IndexError):

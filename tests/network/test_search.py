@@ -250,17 +250,11 @@ def test_input_layouts(tmp_path, dtype, layout, runtime):
     np.testing.assert_allclose(found.vehicles.boxes, [corners], atol=0.02)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"metadata": {"task": "segment"}}, "'segment'; export one for detection"),
-        ({"size": (64, "width")}, "both sides fixed"),
-    ],
-)
-def test_other_networks(tmp_path, options, message):
+def test_a_network_for_another_task(tmp_path):
     file = tmp_path / "other.onnx"
-    file.write_bytes(constant_network({"output0": np.zeros((1, 84, 84), np.float32)}, **options))
-    with pytest.raises(ModelFileError, match=message):
+    outputs = {"output0": np.zeros((1, 84, 84), np.float32)}
+    file.write_bytes(constant_network(outputs, metadata={"task": "segment"}))
+    with pytest.raises(ModelFileError, match="'segment'; export one for detection"):
         load_network(file)
 
 

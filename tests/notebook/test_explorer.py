@@ -139,15 +139,6 @@ def test_the_horizon_of_a_network_is_that_of_the_camera(scenes):
         explorer.set_search(bands=[0])
 
 
-def test_windows_are_those_above_the_threshold(explorer):
-    explorer.set_search(min_score=-100.0)
-    everything = explorer.windows()
-    for threshold in (-1.5, 0.0, 0.4, 3.0):
-        explorer.set_search(min_score=threshold)
-        assert (explorer.windows().scores > threshold).all()
-        assert len(explorer.windows()) == (everything.scores > threshold).sum()
-
-
 def test_bands_are_selected(explorer):
     explorer.set_search(min_score=-100.0)
     everything = explorer.windows()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from importlib import resources
 from typing import Any
 
@@ -131,8 +131,9 @@ def _foreign_model(graph: bytes, facts: GraphFacts) -> NetworkModel:
     image, *extra = _check_inputs(facts)
     channels_first = image.shape[1] == 3 or image.shape[3] != 3
     size = _fixed_size(image, channels_first, name)
-    names = class_names(facts)
-    input_format = InputFormat(size, image.dtype, channels_first, _stride(metadata))
+    names, stride = class_names(facts), metadata.get("stride", "")
+    multiple = max(int(stride), 32) if stride.isdecimal() and len(stride) < 4 else 32
+    input_format = InputFormat(size, image.dtype, channels_first, multiple)
     model = NetworkModel(
         graph=graph,
         name=name,
@@ -193,11 +194,6 @@ def _fixed_size(image: Port, channels_first: bool, name: str) -> Size | None:
             f"{name} has an input of shape {image.shape}; export it with both sides fixed, or none"
         )
     return height, width
-
-
-def _stride(metadata: Mapping[str, str]) -> int:
-    text = metadata.get("stride", "32")
-    return max(int(text), 32) if text.isdecimal() and len(text) < 4 else 32
 
 
 def _output_shapes(model: NetworkModel, facts: GraphFacts, size: Size) -> list[tuple[int, ...]]:

@@ -152,11 +152,9 @@ class Explorer:
         self.box = 0
         self.search_params = detector.search_params
         self.bands = tuple(range(len(self._all_bands)))
-        given = region_params
-        self.method: Method = "heat" if isinstance(given, HeatParams) else "groups"
-        heat = given if isinstance(given, HeatParams) else HeatParams()
-        self.heat_params = heat.for_search(self.search_params)
-        self.group_params = given if isinstance(given, RegionParams) else RegionParams()
+        self.method: Method = "heat" if detector.heat_params else "groups"
+        self.heat_params = detector.heat_params or HeatParams().for_search(self.search_params)
+        self.group_params = region_params if isinstance(region_params, RegionParams) else RegionParams()
 
     @property
     def region_params(self) -> RegionParams | HeatParams:

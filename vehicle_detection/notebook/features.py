@@ -33,17 +33,7 @@ from vehicle_detection.features import (
     sum_blocks,
 )
 from vehicle_detection.notebook import style
-from vehicle_detection.notebook.style import (
-    BLUE,
-    COLORS,
-    LINE_COLORS,
-    OTHER,
-    VEHICLE,
-    VERMILION,
-    YELLOW,
-    FigureLike,
-    Image,
-)
+from vehicle_detection.notebook.style import FigureLike, Image
 from vehicle_detection.svm import CLASSIFIER_REMEDY, Template, VehicleClassifier
 
 if TYPE_CHECKING:
@@ -181,7 +171,7 @@ def _pixels_by_class(images: object, labels: ArrayLike | None) -> list[tuple[str
         return [(None, "0.35", np.concatenate(flat))]
     return [
         (name, color, np.concatenate(list(itertools.compress(flat, mask))))
-        for name, color, mask in (("vehicle", VEHICLE, known > 0), ("other", OTHER, known <= 0))
+        for name, color, mask in (("vehicle", style.VEHICLE, known > 0), ("other", style.OTHER, known <= 0))
         if mask.any()
     ]
 
@@ -271,11 +261,11 @@ def plot_features(
     raw = extract_features(images[chosen], params)
     figure, grid = style.new_panels(figure, (11, 5.5), 2, 1, sharex=True)
     above, below = grid.flat
-    shades = (COLORS[1], COLORS[3], "0.6", COLORS[2])
-    colors = [VEHICLE, OTHER, *LINE_COLORS[2:]]
+    shades = (style.COLORS[1], style.COLORS[3], "0.6", style.COLORS[2])
+    colors = [style.VEHICLE, style.OTHER, *style.LINE_COLORS[2:]]
     classes = patches.labels[chosen].tolist() if isinstance(patches, PatchSet) else []
     if classes and len(set(classes)) == len(classes):  # at most one row of each class
-        colors = [VEHICLE if vehicle else OTHER for vehicle in classes]
+        colors = [style.VEHICLE if vehicle else style.OTHER for vehicle in classes]
     for panel, values in ((above, raw), (below, (raw - mean) / scale)):
         for line, label, color in zip(values, labels, colors * len(chosen)):
             text = None if label is None else str(label)
@@ -442,12 +432,12 @@ def plot_explanation(
     around = _AROUND * max(right - left, bottom - top)
     for panel, title in ((plain, score), (shares, "share of each cell, orange: for a vehicle")):
         style.add_image(panel, image, title)
-        style.add_boxes(panel, explanation.box[None], YELLOW)
+        style.add_boxes(panel, explanation.box[None], style.YELLOW)
         panel.set_xlim(max(first[0] - around, -0.5), min(last[2] + around, width - 0.5))
         panel.set_ylim(min(last[3] + around, height - 0.5), max(first[1] - around, -0.5))
     peak = float(np.abs(explanation.cells).max()) or 1.0
     colors = np.empty((*explanation.cells.shape, 4))
-    colors[..., :3] = np.where(explanation.cells[..., None] > 0, to_rgb(VERMILION), to_rgb(BLUE))
+    colors[..., :3] = np.where(explanation.cells[..., None] > 0, to_rgb(style.VERMILION), to_rgb(style.BLUE))
     colors[..., 3] = _MAX_ALPHA * np.abs(explanation.cells) / peak
     limits = shares.get_xlim(), shares.get_ylim()
     shares.imshow(colors, extent=(left, right, bottom, top), interpolation="nearest", zorder=2)
@@ -456,7 +446,8 @@ def plot_explanation(
     ends = np.concatenate(([0.0], np.cumsum(values)))
     starts = ends[:-1]
     rows = np.arange(len(values))
-    sums.barh(rows, values, left=starts, color=[VERMILION if value > 0 else BLUE for value in values])
+    bar_colors = [style.VERMILION if value > 0 else style.BLUE for value in values]
+    sums.barh(rows, values, left=starts, color=bar_colors)
     for row, start, value in zip(rows.tolist(), starts.tolist(), values):
         end = max(start, start + value), row
         # White behind the text, which the line of the margin may cross.
