@@ -20,6 +20,8 @@ EVENTS = [
 
 def test_csv_and_json_hold_the_same(tmp_path):
     table, document = tmp_path / "events.csv", tmp_path / "events.json"
+    assert write_events([], table) == 0
+    assert table.read_text() == ",".join(EVENT_COLUMNS) + "\n"
     assert write_events(EVENTS, table) == write_events(EVENTS, document) == 2
     with table.open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -29,11 +31,6 @@ def test_csv_and_json_hold_the_same(tmp_path):
     assert [
         {name: "" if value is None else str(value) for name, value in each.items()} for each in objects
     ] == rows
-
-
-def test_no_events_give_a_header(tmp_path):
-    write_events([], tmp_path / "events.csv")
-    assert (tmp_path / "events.csv").read_text() == ",".join(EVENT_COLUMNS) + "\n"
 
 
 @pytest.mark.parametrize(

@@ -69,13 +69,10 @@ def test_an_outlier_is_not_the_closest_approach():
     assert approach.std_m == 1.0
 
 
-def test_the_closest_approach_of_few_known_distances():
+def test_the_closest_approach_of_few_known_distances_and_in_other_units():
     assert history([5], [12.0]).closest_approach(25.0) == (5, 12.0, 1.0)
     assert history([5, 6], [math.nan, 12.0]).closest_approach(0.1).frame == 6
     assert history([5], [math.nan]).closest_approach(25.0) is None
-
-
-def test_the_closest_approach_does_not_depend_on_the_unit():
     rng = np.random.default_rng(0)
     for _ in range(50):
         distances = rng.uniform(5, 9, 40).round(2)

@@ -63,23 +63,15 @@ def test_a_change_is_made_in_one_place():
         assert sum(line != before for line, before in pairs) == 1
 
 
-def test_tests_that_execute_the_line_come_first():
+def test_tests_that_execute_the_line_come_first_then_those_of_the_module():
     path = ROOT / "a.py"
-    seconds = {
-        "tests/a.py::slow": 5.0,
-        "tests/a.py::fast": 1.0,
-        "tests/a.py::other": 0.5,
-        "tests/b.py::b": 0.1,
-    }
-    baseline = Baseline(seconds, {str(path): {"3": ["tests/a.py::slow", "tests/a.py::fast"]}})
     names = ["tests/a.py::fast", "tests/a.py::slow", "tests/a.py::other"]
+    seconds = dict(zip([*names, "tests/b.py::b"], (1.0, 5.0, 0.5, 0.1)))
+    baseline = Baseline(seconds, {str(path): {"3": names[1::-1]}})
     assert baseline.tests_for(path, 3, ["tests/a.py"], 10) == names
     assert baseline.tests_for(path, 3, ["tests/a.py"], 2) == names[:1]
-    assert baseline.tests_for(path, 4, ["tests/a.py"], 0.1) == ["tests/a.py::other"]
-
-
-def test_tests_of_the_module_precede_others_where_no_test_executes_the_line():
-    path = ROOT / "a.py"
+    assert baseline.tests_for(path, 4, ["tests/a.py"], 0.1) == names[2:]
+    # No test executes the line.
     seconds = {"tests/test_b.py::b": 0.1, "tests/test_a.py::slow": 2.0, "tests/test_a.py::fast": 1.0}
     baseline = Baseline(seconds, {str(path): {}})
     names = ["tests/test_a.py::fast", "tests/test_a.py::slow", "tests/test_b.py::b"]
