@@ -152,7 +152,7 @@ import signal, threading
 from vehicle_detection.video.ffmpeg import Process
 processes = []
 def start():
-    options = ("-nostdin", "-re", "-f", "lavfi", "-i", "testsrc", {str(tmp_path / "out.mkv")!r})
+    options = ("-re", "-f", "lavfi", "-i", "testsrc", {str(tmp_path / "out.mkv")!r})
     processes.append(Process(options))
 thread = threading.Thread(target=start)
 thread.start()
@@ -189,7 +189,7 @@ def test_an_interrupt_while_ffmpeg_starts_leaves_no_process(clip, monkeypatch):
     before = child_processes()
     monkeypatch.setattr("concurrent.futures.Future.result", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        Process(("-nostdin", "-f", "lavfi", "-i", "testsrc", "-f", "null", "-"))
+        Process(("-f", "lavfi", "-i", "testsrc", "-f", "null", "-"))
     deadline = time.monotonic() + 60
     while child_processes() != before and time.monotonic() < deadline:
         time.sleep(0.01)

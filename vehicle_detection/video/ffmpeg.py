@@ -183,14 +183,20 @@ class Process:
     """A running ffmpeg. Its log goes to a file, because a full pipe would block it."""
 
     def __init__(
-        self, options: Sequence[str], *, level: str = "error", stdin: bool | int = False, stdout: bool = False
+        self,
+        options: Sequence[str],
+        *,
+        level: str = "error",
+        stdin: int = subprocess.DEVNULL,
+        stdout: bool = False,
     ) -> None:
-        """Start ffmpeg; `stdin` is True for a pipe to it, or the descriptor of a file that it reads."""
+        """Start ffmpeg; `stdin` is a descriptor that it reads, or ``subprocess.PIPE`` for a pipe to it."""
         # In its own process group, so that Ctrl-C in the terminal reaches only Python, which ends ffmpeg. Not
         # in its own session: Linux schedules by session, which costs a third of the speed on a busy machine.
         group: dict[str, Any] = {"process_group": 0}
         if sys.platform == "win32":
             group = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+        nostdin = ["-nostdin"] if stdin == subprocess.DEVNULL else []
         self.cpu_seconds = 0.0
         """Processor time, known after the process has ended, on systems that report it."""
         self._lock = threading.Lock()
@@ -198,10 +204,8 @@ class Process:
             self._log = on_error.enter_context(tempfile.TemporaryFile())
             try:
                 self._popen: subprocess.Popen[bytes] = _STARTER.start(
-                    [ffmpeg_binary(), "-hide_banner", "-loglevel", level, *options],
-                    stdin=(subprocess.PIPE if stdin else subprocess.DEVNULL)
-                    if isinstance(stdin, bool)
-                    else stdin,
+                    [ffmpeg_binary(), "-hide_banner", "-loglevel", level, *nostdin, *options],
+                    stdin=stdin,
                     stdout=subprocess.PIPE if stdout else subprocess.DEVNULL,
                     stderr=self._log,
                     bufsize=0,
@@ -281,6 +285,14 @@ def _enlarge(pipe: IO[bytes] | None) -> None:
 
         with contextlib.suppress(OSError):  # limited for unprivileged users; the default of 64 KiB works too
             fcntl.fcntl(pipe.fileno(), fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+
+
+def run_ffmpeg(path: Path | str, options: Sequence[str], *, level: str) -> tuple[int, str]:
+    """Run ffmpeg on a file or URL to its end, and return its exit code and its log."""
+    with contextlib.closing(Process(options, level=level)) as process:
+        code, log = process.wait(), process.log()
+    check_resources(source_name(path), code, log)
+    return code, log
 
 
 def exit_reason(code: int, log: str) -> str:

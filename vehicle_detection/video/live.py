@@ -7,6 +7,7 @@ import logging
 import math
 import re
 import select
+import subprocess
 import sys
 import threading
 import time
@@ -52,7 +53,7 @@ class _LiveProcess:
     """
 
     def __init__(
-        self, name: str, options: Sequence[str], *, stdin: int | None, like: VideoInfo | None, timed: bool
+        self, name: str, options: Sequence[str], *, stdin: int, like: VideoInfo | None, timed: bool
     ) -> None:
         self.name, self._timed = name, timed
         self._stalled = False
@@ -64,11 +65,7 @@ class _LiveProcess:
             filters = f"scale={like.width}:{like.height}:out_color_matrix=bt601:out_range=tv"
             rate = ("-r", str(like.fps))
         output = ("-map", "0:V:0", "-vf", filters, *rate, "-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe")
-        command = (*pixel_limit(), *options, *output, "pipe:1")
-        if stdin is None:
-            self.process = Process(("-nostdin", *command), stdout=True)
-        else:
-            self.process = Process(command, stdin=stdin, stdout=True)
+        self.process = Process((*pixel_limit(), *options, *output, "pipe:1"), stdin=stdin, stdout=True)
 
     def read_info(self) -> VideoInfo:
         """Read the header of the stream."""
@@ -132,7 +129,7 @@ class LiveStream(Reader):
         name: str,
         options: Sequence[str],
         *,
-        stdin: int | None = None,
+        stdin: int = subprocess.DEVNULL,
         network: bool = False,
         reconnect: bool = False,
     ) -> None:

@@ -26,6 +26,7 @@ from vehicle_detection.video.ffmpeg import (
     input_options,
     last_line,
     pixel_limit,
+    run_ffmpeg,
     seconds_of,
     source_name,
     video_error,
@@ -164,12 +165,8 @@ def _read_log(path: Path | str) -> tuple[str, str, str]:
     """
     # "V" excludes cover pictures. Only the showinfo filter prints the exact frame rate.
     options = ("-map", "0:V:0", "-frames:v", "1", "-vf", f"{SQUARE_PIXELS},showinfo", "-f", "null", "-")
-    source = ("-nostdin", *pixel_limit(), *input_options(path))
     name = source_name(path)
-    with contextlib.closing(Process((*source, *options), level="info")) as process:
-        code = process.wait()
-        log = process.log()
-    check_resources(name, code, log)
+    code, log = run_ffmpeg(path, (*pixel_limit(), *input_options(path), *options), level="info")
     if code < 0:
         raise video_error(f"{name} cannot be read: {exit_reason(code, log)}", path, code, log)
     check_frame_size(name, log)
@@ -228,7 +225,7 @@ def frame_rate(decoded: str, stream: str) -> tuple[Fraction, bool]:
 def _frame_times(path: Path | str) -> list[float]:
     """List the times of all frames in seconds, without decoding them; of a URL those of its beginning."""
     limit = () if isinstance(path, Path) else ("-t", _REMOTE_SECONDS)
-    options = ("-nostdin", *limit, *input_options(path), "-map", "0:V:0", "-c", "copy")
+    options = (*limit, *input_options(path), "-map", "0:V:0", "-c", "copy")
     options += ("-f", "framecrc", "pipe:1")
     with contextlib.closing(Process(options, stdout=True)) as process:
         listing = process.stdout.read().decode()

@@ -6,7 +6,6 @@ cannot decode and ends with exit code 0, so its frames and its log must be check
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 import re
@@ -28,6 +27,7 @@ from vehicle_detection.video.ffmpeg import (
     input_options,
     last_line,
     pixel_limit,
+    run_ffmpeg,
     seconds_of,
     source_name,
     video_error,
@@ -130,7 +130,7 @@ class FrameReader(Reader):
         self._buffer = np.empty((height * 3 // 2, width) if self._in_planes else info.shape, np.uint8)
         self._channels = np.empty((3, height, width), np.uint8)
         options += ["-pix_fmt", pixel_format, "-f", "rawvideo", "pipe:1"]
-        self._process = Process(("-nostdin", *options), stdout=True)
+        self._process = Process(options, stdout=True)
 
     def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
         if self._process.stdout.closed:
@@ -227,9 +227,8 @@ def _first_time(path: Path | str, seek: float) -> float:
     """
     options = ("-noaccurate_seek", "-ss", f"{seek:.6f}", *input_options(path), "-map", "0:V:0")
     options += ("-frames:v", "1", "-vf", "showinfo", "-f", "null", "-")
-    with contextlib.closing(Process(("-nostdin", *options), level="info")) as process:
-        check_resources(source_name(path), process.wait(), process.log())
-        found = re.search(r"n: *0 .*?pts_time:(-?[\d.]+).*? iskey:1 ", process.log())
+    _, log = run_ffmpeg(path, options, level="info")
+    found = re.search(r"n: *0 .*?pts_time:(-?[\d.]+).*? iskey:1 ", log)
     return float(found[1]) if found else math.inf
 
 
@@ -279,10 +278,8 @@ def _announced_frames(path: Path | str, info: VideoInfo, end: int, *, exact: boo
 
 def stream_duration(path: Path | str, info: VideoInfo) -> float | None:
     """Duration of the video stream in seconds; None if the file does not state it."""
-    options = ("-nostdin", *input_options(path), "-map", "0:V:0", "-c", "copy", "-frames:v", "1")
-    with contextlib.closing(Process((*options, "-f", "null", "-"), level="trace")) as process:
-        code, log = process.wait(), process.log()
-    check_resources(source_name(path), code, log)
+    options = (*input_options(path), "-map", "0:V:0", "-c", "copy", "-frames:v", "1")
+    _, log = run_ffmpeg(path, (*options, "-f", "null", "-"), level="trace")
     mapped = re.search(r"Stream #0:(\d+) -> #0:0", log)
     index = mapped[1] if mapped else "0"
     exact = re.search(rf"stream {index}: start_time: \S+ duration: ([\d.]+)", log)

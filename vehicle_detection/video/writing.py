@@ -7,6 +7,7 @@ import dataclasses
 import os
 import shutil
 import signal
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -92,7 +93,7 @@ class FrameWriter(Closing):
         if container != "matroska":  # the index at the front lets a browser play while it downloads
             self._muxer += ["-movflags", "+faststart"]
         options = ["-y", *video, "-i", "pipe:0", *sound, *mapped, *encoder, *self._muxer, f"file:{path}"]
-        self._process = Process(options, stdin=True)
+        self._process = Process(options, stdin=subprocess.PIPE)
 
     def kill(self) -> None:
         """End ffmpeg at once, from any thread; a thread that writes sees an error."""
@@ -135,7 +136,7 @@ class FrameWriter(Closing):
         whole = ("-i", f"file:{self._path}")
         with temporary_folder(self._path.parent, self._path.stem) as folder:
             trimmed = folder / self._path.name
-            options = ["-nostdin", *whole, "-t", f"{seconds:.6f}", *whole, "-map", "0:v:0", "-map", "1:a:0"]
+            options = [*whole, "-t", f"{seconds:.6f}", *whole, "-map", "0:v:0", "-map", "1:a:0"]
             self.close()
             self._process = Process([*options, "-c", "copy", *self._muxer, f"file:{trimmed}"])
             if self._process.wait():
