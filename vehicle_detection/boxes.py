@@ -118,19 +118,11 @@ class Detections:
     ) -> Detections:
         """Convert the detections of another library, such as ``supervision.Detections``.
 
-        Parameters
-        ----------
-        detections
-            An object with ``xyxy``, ``(N, 4)``, with ``confidence`` or ``conf``, ``(N,)`` or None if unknown
-            (the score is then 3), and, if known, with ``class_id`` or ``cls``, ``(N,)``. The second names are
-            those of the ``boxes`` of Ultralytics' results.
-        score, threshold
-            What the confidences are, as in `detector_from`; they become log-odds above the threshold.
-        class_ids
-            Keep only boxes of these classes, such as ``(2, 5, 7)`` for the cars, buses and trucks of COCO.
+        They have ``xyxy``, ``(N, 4)``, ``confidence`` or ``conf``, ``(N,)`` or None if unknown (the score is
+        then 3), and, if known, ``class_id`` or ``cls``, ``(N,)``; the second names are those of the ``boxes``
+        of Ultralytics' results. `score` and `threshold` are as in `detector_from`. `class_ids` keeps only
+        boxes of these classes, such as ``(2, 5, 7)`` for the cars, buses and trucks of COCO.
 
-        Examples
-        --------
         >>> from types import SimpleNamespace
         >>> found = SimpleNamespace(xyxy=[[0, 0, 9, 9], [5, 5, 9, 9]], confidence=[0.5, 0.9], class_id=[2, 0])
         >>> Detections.from_supervision(found), Detections.from_supervision(found, class_ids=[0])

@@ -107,12 +107,10 @@ class Explorer:
     model, names, frame, view, box
         The model; names of the frames and of the current one; what images show; and the number of the box
         that they explain, from 1 for the best one, 0 for none.
-    search_params, bands
-        Current search parameters; for a classifier of patches with all bands, of which those numbered in
-        `bands` are searched.
-    method, group_params, heat_params
-        ``"groups"``: boxes from groups of agreeing windows, or those that the model predicts, with
-        `RegionParams`. ``"heat"``: boxes from the heat map, with `HeatParams`.
+    search_params, bands, method, group_params, heat_params
+        Current parameters: those of the search, with all bands, of which those numbered in `bands` are
+        searched; and ``"groups"``, boxes from groups of agreeing windows or predicted by the model, or
+        ``"heat"``, from the heat map, with the parameters of both.
 
     Examples
     --------

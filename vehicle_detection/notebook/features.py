@@ -107,18 +107,11 @@ def plot_channels(
 ) -> FigureLike:
     """Plot the distribution of pixels in a color space, of each channel and of pairs of channels.
 
-    Parameters
-    ----------
-    images, color_space
-        One ``(H, W, 3)`` uint8 RGB image, several images, or a set of patches; and one of ``COLOR_SPACES``.
-    labels
-        ``(N,)`` 1 for a vehicle, 0 for anything else: one curve per class. None takes those of a set.
-    points, random_state
-        Number of randomly chosen pixels per class in the lower panels, and seed of the choice; without
-        labels each point has the color of its pixel.
+    `images` is one ``(H, W, 3)`` uint8 RGB image, several images, or a set of patches. With `labels`,
+    ``(N,)`` 1 for a vehicle and 0 for anything else, by default those of a set, there is a curve per class;
+    without, each point has the color of its pixel. The lower panels show `points` randomly chosen pixels per
+    class.
 
-    Examples
-    --------
     >>> figure = plot_channels(np.full((8, 8, 3), 90, np.uint8), "HSV")
     >>> [panel.get_xlabel() for panel in figure.axes]
     ['H', 'S', 'V', 'H', 'H', 'S']
@@ -236,18 +229,9 @@ def plot_features(
     """Plot feature vectors, a line per row, before and after scaling, with their parts shaded.
 
     Before scaling, histogram counts are much larger than HOG values; after scaling, all parts have the same
-    range.
+    range. `rows` are numbers of the ``(N, 64, 64, 3)`` `patches`, with one of `names` each. The scaler is
+    that of a template of a classifier; for a `model` of parameters, it is fitted to all of `patches`.
 
-    Parameters
-    ----------
-    patches, rows, names
-        ``(N, 64, 64, 3)`` uint8 RGB, or a set; row numbers of the patches to plot; and one name per row.
-    model, template
-        A classifier and the number of the template whose scaler is used; or parameters, with the scaler
-        fitted to all of `patches`.
-
-    Examples
-    --------
     >>> from vehicle_detection import render_patches
     >>> figure = plot_features(render_patches(8)[0], FeatureParams(hog_channel=0))
     >>> len(figure.axes[1].lines[0].get_ydata())

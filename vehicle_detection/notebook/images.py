@@ -75,19 +75,11 @@ def show_images(
 ) -> FigureLike:
     """Show images in a row or a grid.
 
-    Parameters
-    ----------
-    images, titles
-        ``(H, W, 3)`` uint8 RGB, or ``(H, W)`` numbers, shown in gray; and one title per image, by default the
-        keys if `images` is a mapping.
-    boxes, truth
-        Boxes to draw on each image, or None: `Detections`, `TrackTable` or ``(N, 4)``; and labelled boxes in
-        the same form, drawn with dashed lines.
-    columns
-        Images per row; None for up to three.
+    `images` are ``(H, W, 3)`` uint8 RGB, or ``(H, W)`` numbers, shown in gray, with a title each, by default
+    the keys of a mapping. `boxes` are those to draw on each image, or None: `Detections`, `TrackTable` or
+    ``(N, 4)``; `truth` are labelled boxes in the same form, drawn with dashed lines. There are up to three
+    images per row.
 
-    Examples
-    --------
     >>> road = np.full((72, 128, 3), 90, np.uint8)
     >>> figure = show_images({"first": road, "second": road}, boxes=[[[10, 10, 30, 30]], None])
     >>> [panel.get_title() for panel in figure.axes]
@@ -160,19 +152,10 @@ def plot_patches(
 ) -> Axes:
     """Show patches on a grid, each with a caption and an edge in the color of its class.
 
-    Parameters
-    ----------
-    patches, count, columns
-        A set, or ``(H, W, 3)`` images; maximum number, chosen at even distances if there are more; and
-        patches per row.
-    labels
-        ``(N,)`` 1 for a vehicle, 0 for anything else. None takes those of a set, or draws no edges.
-    captions, scores
-        One caption per patch, by default the source of a set's patches; and ``(N,)`` numbers to add to the
-        captions, such as decision values.
+    `patches` are a set or ``(H, W, 3)`` images, of which at most `count` are shown, chosen at even distances.
+    `labels` are ``(N,)`` 1 for a vehicle, 0 for anything else, and `captions` a text each, by default classes
+    and sources of a set; `scores` are ``(N,)`` numbers to add to the captions, such as decision values.
 
-    Examples
-    --------
     >>> from vehicle_detection import render_patches
     >>> patches, labels = render_patches(20)
     >>> len(plot_patches(patches, labels=labels, count=8).images)

@@ -200,20 +200,11 @@ def plot_errors(
 ) -> Axes:
     """Show crops of the worst errors: the largest missed vehicles, or the false positives of highest score.
 
-    Labelled boxes are dashed, detections solid; the title counts all errors.
+    ``"missed"`` are labelled vehicles without a detection of at least `iou`, with the largest IoU of any;
+    ``"false"`` are detections without a labelled vehicle. `predictions` are boxes with scores, as
+    `TrackTable.from_detections` makes. Labelled boxes are dashed, detections solid. The title counts all
+    errors, of which `count` are shown.
 
-    Parameters
-    ----------
-    frames, predictions
-        Frames with their true boxes; and predicted boxes with scores, as `TrackTable.from_detections` makes.
-    kind
-        ``"missed"``: labelled vehicles without a detection, with the largest IoU of any detection;
-        ``"false"``: detections without a labelled vehicle.
-    iou, count, columns
-        Minimum IoU of a detection and its vehicle; maximum number of errors to show; and crops per row.
-
-    Examples
-    --------
     >>> labels = TrackTable([0], None, [[10, 10, 60, 50]])
     >>> frames = LabelledFrames("road", [np.zeros((90, 120, 3), np.uint8)], labels)
     >>> plot_errors(frames, TrackTable(score=[])).get_title()

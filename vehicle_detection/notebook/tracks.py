@@ -60,21 +60,11 @@ def plot_tracks(
 ) -> FigureLike:
     """Plot position, width, distance and speed of each track over time, in the colors of the video.
 
-    Distances and speeds of results have bands of one standard error.
+    `results` are those of each frame, whose shown tracks are plotted, with bands of one standard error; or
+    the boxes of a tracks file with numbered frames, as `read_labels` returns. `truth` are true boxes, drawn
+    as black dots, such as the ``labels`` of a rendered drive, which include distances and speeds; ignored
+    boxes are left out, and tracks in less than `min_frames`. `fps` is for frames without a time.
 
-    Parameters
-    ----------
-    results
-        The detector's result of each frame, whose shown tracks are plotted; or the boxes of a tracks file
-        with numbered frames, as `read_labels` returns.
-    truth
-        True boxes, drawn as black dots: labels, such as the ``labels`` of a rendered drive, which include
-        distances and speeds. Ignored boxes are left out.
-    fps, min_frames
-        Frame rate, for frames without a time; and number of frames below which a track is left out.
-
-    Examples
-    --------
     >>> boxes = [[10.0 + frame, 20.0, 60.0 + frame, 60.0] for frame in range(5)]
     >>> figure = plot_tracks(TrackTable(range(5), [1] * 5, boxes), fps=10)
     >>> figure.axes[0].lines[0].get_xydata()[-1].tolist()
@@ -222,18 +212,9 @@ def plot_birds_eye(
     standard error around the middle of its near end, and an arrow to where it is in a second, relative to the
     camera. Vehicles without a known distance are left out.
 
-    Parameters
-    ----------
-    results
-        The detector's result of a frame, or those of consecutive frames: the last one is plotted, and the
-        others give the trails.
-    camera, shape
-        The camera, by default a typical dash-cam; and ``(height, width, ...)`` of the frames.
-    fps, trail_seconds
-        Frame rate, for results without a time; and the time that the trails cover.
+    `results` are the detector's result of a frame, or those of consecutive frames of this `shape`: the last
+    one is plotted, and the others give the trails, of `trail_seconds`. `fps` is for results without a time.
 
-    Examples
-    --------
     >>> from vehicle_detection import Detections, Tracker
     >>> tracker = Tracker(fps=25)
     >>> for frame in range(25):
