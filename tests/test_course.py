@@ -74,26 +74,17 @@ def models():
     return found
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", [*DTYPES, np.float64, np.int64, np.uint16])
 @pytest.mark.parametrize("cell", [4, 7, 8, 16])
 @pytest.mark.parametrize("transform_sqrt", [False, True])
 def test_hog_equals_scikit_image(dtype, cell, transform_sqrt):
-    channel = FRAMES[dtype][:75, :101, 1]
+    channel = (FRAMES[dtype] if dtype in DTYPES else FRAMES["uint8"].astype(dtype))[:75, :101, 1]
     options = {"feature_vec": False, "transform_sqrt": transform_sqrt}
     found = lesson.get_hog_features(channel, 9, cell, 2, **options)
     expected = reference.get_hog_features(channel, 9, cell, 2, **options)
     assert found.dtype == expected.dtype
     assert found.flags.c_contiguous
     np.testing.assert_allclose(found, expected, rtol=0, atol=HOG_TOLERANCE)
-
-
-def test_hog_of_other_numbers():
-    channel = FRAMES["uint8"][..., 0]
-    for dtype in (np.float64, np.int64, np.uint16):
-        found = lesson.get_hog_features(channel.astype(dtype), 8, 8, 3)
-        expected = reference.get_hog_features(channel.astype(dtype), 8, 8, 3)
-        assert found.dtype == np.float64
-        np.testing.assert_allclose(found, expected, rtol=0, atol=HOG_TOLERANCE)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -141,14 +132,7 @@ def test_color_conversion_is_that_of_opencv(conv, dtype):
     np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("space", ["HSV", "HLS", "LUV", "LAB", "YUV", "YCrCb"])
-def test_inverse_color_conversions(space):
-    image = FRAMES["0-1"]
-    back = lesson.convert_color(lesson.convert_color(image, f"BGR2{space}"), f"{space}2BGR")
-    np.testing.assert_allclose(back, image, atol=0.01)
-
-
-def test_color_conversion_by_the_name_of_the_space():
+def test_names_of_color_conversions():
     image = FRAMES["uint8"]
     for one, other in (("Lab", "LAB"), ("rgb2ycrcb", "RGB2YCrCb"), ("RGB2Gray", "RGB2GRAY")):
         np.testing.assert_array_equal(lesson.convert_color(image, one), lesson.convert_color(image, other))
@@ -157,6 +141,9 @@ def test_color_conversion_by_the_name_of_the_space():
     assert copy is not image
     np.testing.assert_array_equal(copy, image)
     assert lesson.convert_color(image / 255.0).dtype == np.float32
+    for space in ("HSV", "HLS", "LUV", "LAB", "YUV", "YCrCb"):
+        converted = lesson.convert_color(FRAMES["0-1"], f"BGR2{space}")
+        np.testing.assert_allclose(lesson.convert_color(converted, f"{space}2BGR"), FRAMES["0-1"], atol=0.01)
 
 
 FEATURE_OPTIONS = [
@@ -177,7 +164,8 @@ FEATURE_OPTIONS = [
 def test_features_equal_the_definition(dtype, options):
     if dtype == "0-1" and options.get("transform_sqrt"):
         options = {**options, "color_space": "YCrCb"}
-    images = PATCHES[::12] if dtype == "uint8" else PATCHES[::12].astype(np.float32) / 255
+    images = [*PATCHES[::12], FRAMES["uint8"]] if options == {} else PATCHES[::12]
+    images = images if dtype == "uint8" else [image.astype(np.float32) / 255 for image in images]
     found = lesson.extract_features(images, **options)
     expected = reference.extract_features(images, **options)
     assert isinstance(found, list)
@@ -202,12 +190,6 @@ def test_transparency_is_dropped_from_arrays(dtype):
         lesson.convert_color,
     ):
         np.testing.assert_array_equal(function(transparent), function(patch))
-
-
-def test_features_of_images_that_are_not_64x64():
-    image = FRAMES["uint8"]
-    found, expected = (module.single_img_features(image, "YCrCb") for module in (lesson, reference))
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=HOG_TOLERANCE)
 
 
 @pytest.fixture(scope="module")
@@ -315,20 +297,6 @@ def test_windows_are_those_of_the_lesson(side, start, stop, overlap, formula):
     assert lesson.slide_window(image, *floats, formula=formula) == expected
 
 
-def test_the_first_system_has_130_windows():
-    lists = [
-        lesson.slide_window(np.zeros((720, 1280, 3)), [650, None], rows, window, overlap)
-        for rows, window, overlap in [
-            ([395, 530], (96, 96), (0.9, 0.5)),
-            ([380, 590], (110, 145), (0.7, 0.6)),
-            ([370, 590], (155, 165), (0.6, 0.5)),
-            ([400, 700], (170, 200), (0.6, 0.5)),
-        ]
-    ]
-    assert [len(windows) for windows in lists] == [69, 36, 9, 16]
-    assert max(x2 for windows in lists for _, (x2, _) in windows) > 1280
-
-
 @pytest.mark.parametrize("dtype", ["uint8", "0-1"])
 @pytest.mark.parametrize("name", ["all", "luv", "hog", "color"])
 def test_window_hits_equal_the_definition(models, dtype, name):
@@ -409,15 +377,6 @@ def test_find_cars_equals_the_definition(models, dtype, options, scale, name):
     np.testing.assert_array_equal(drawn, reference.draw_boxes(image, expected))
 
 
-def test_find_cars_finds_something(models):
-    for dtype, divide_by in (("uint8", 1), ("0-1", 255)):
-        case = models["all", dtype]
-        boxes = lesson.find_car_windows(
-            FRAMES["uint8"], 60, 200, 1, *case.model, 9, 8, 2, (16, 16), 16, divide_by=divide_by
-        )
-        assert 0 < len(boxes) < 100
-
-
 def test_the_fast_search_has_the_hits_of_the_lesson(models):
     svc, scaler = models["all", "uint8"].model
     scores = []
@@ -435,27 +394,33 @@ def test_the_fast_search_has_the_hits_of_the_lesson(models):
     assert len(found ^ expected) <= uncertain
 
 
+def old_version(estimator):
+    """The estimator as scikit-learn before 0.24 has pickled it."""
+    estimator = copy.deepcopy(estimator)
+    del estimator.n_features_in_
+    return estimator
+
+
 def test_the_fast_search_is_used_where_it_applies(models, monkeypatch):
     case = models["all", "uint8"]
-    monkeypatch.setattr(search_module._Estimators, "predict", None)
-    lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, *case.model, 9, 8, 2, (16, 16), 16, divide_by=1)
-    lesson.search_windows(FRAMES["uint8"], PAIRS, *case.model, **case.options)
-
-
-def test_a_grid_search_uses_the_fast_search_too(models, monkeypatch):
-    case = models["all", "uint8"]
-    scaler = case.model[1]
+    svc, scaler = case.model
     grid = GridSearchCV(LinearSVC(random_state=0, max_iter=10_000), {"C": [0.01]}, cv=2)
     grid.fit(scaler.transform(case.X), LABELS)
-    arguments = (9, 8, 2, (16, 16), 16)
-    hits = [
-        lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, clf, scaler, *arguments, divide_by=1)
-        for clf in (grid, grid.best_estimator_)
+    given = [
+        (svc, scaler),
+        (grid, scaler),
+        (grid.best_estimator_, scaler),
+        tuple(map(old_version, case.model)),
     ]
-    assert hits[0] == hits[1] != []
     monkeypatch.setattr(search_module._Estimators, "predict", None)
-    lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, grid, scaler, *arguments, divide_by=1)
-    lesson.search_windows(FRAMES["uint8"], PAIRS, grid, scaler, **case.options)
+    arguments, hits = (9, 8, 2, (16, 16), 16), []
+    for model in given:
+        lesson.search_windows(FRAMES["uint8"], PAIRS, *model, **case.options)
+        hits.append(lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, *model, *arguments, divide_by=1))
+    assert hits[1] == hits[2] != []
+    assert hits[3] == hits[0] != []
+    with pytest.raises(InvalidInputError, match="fitted on 6108 features, but these options give 8460"):
+        lesson.find_cars(FRAMES["uint8"], 60, 200, 1, *given[3], 9, 8, 2, (32, 32), 32, divide_by=1)
 
 
 def test_a_changed_model_is_noticed(models):
@@ -477,6 +442,8 @@ def test_a_changed_model_is_noticed(models):
     svc.intercept_ *= -1
     # All windows that were not found before.
     assert sorted(search() + before) == sorted(everything)
+    svc.predict = lambda features: np.zeros(len(features))
+    assert search() == []
 
 
 def test_cells_that_do_not_divide_a_window():
@@ -497,18 +464,17 @@ def test_a_float_image_from_0_to_1_is_not_divided(models):
     assert found[0] == found[1] == found[2] != []
 
 
-def test_a_mismatch_of_the_range_of_values_warns(models):
-    for trained_on, given_as in (("uint8", "0-1"), ("0-1", "uint8"), ("0-1", "0-255")):
-        case = models["all", trained_on]
-        with pytest.warns(UserWarning, match="the scaler was fitted on values 0-"):
-            lesson.search_windows(FRAMES[given_as], PAIRS, *case.model, **case.options)
-    case = models["all", "uint8"]
-    with pytest.warns(UserWarning, match="divide_by=1"):
-        lesson.find_cars(FRAMES["uint8"], 60, 200, 1, *case.model, 9, 8, 2, (16, 16), 16)
-    with pytest.warns(UserWarning, match="0-255"):
-        lesson.find_cars(
-            FRAMES["uint8"], 60, 200, 1, *models["all", "0-1"].model, 9, 8, 2, (16, 16), 16, divide_by=1
-        )
+@pytest.mark.parametrize("space", ["HLS", "HSV", "LUV", "LAB", "YCrCb"])
+def test_a_mismatch_of_the_range_of_values_warns(space):
+    options = {"color_space": space, "spatial_size": (16, 16), "hist_bins": 16, "hog_channel": "ALL"}
+    for images, trained_on, other in ((PATCHES, "0-255", "0-1"), (PATCHES / np.float32(255), "0-1", "uint8")):
+        model = trained(np.array(lesson.extract_features(images, **options)))
+        with pytest.warns(UserWarning, match=f"the scaler was fitted on values {trained_on}, .*divide_by=1"):
+            lesson.search_windows(FRAMES[other], PAIRS, *model, **options)
+        band = (FRAMES["uint8"], 60, 200, 1, *model, 9, 8, 2, (16, 16), 16)
+        divide_by = 255 if trained_on == "0-255" else 1
+        with pytest.warns(UserWarning, match=f"the scaler was fitted on values {trained_on}"):
+            lesson.find_cars(*band, color_space=space, divide_by=divide_by)
 
 
 UNIT_SPACES = ["RGB", "YUV", "YCrCb", "HSV", "HLS"]
@@ -564,16 +530,6 @@ def test_the_warning_names_the_line_of_the_caller(models):
         assert {warning.filename for warning in caught} == {__file__}
 
 
-def test_old_estimators_take_the_fast_search(models, monkeypatch):
-    """``n_features_in_`` was added in scikit-learn 0.24."""
-    svc, scaler = copy.deepcopy(models["all", "uint8"].model)
-    del svc.n_features_in_, scaler.n_features_in_
-    monkeypatch.setattr(search_module._Estimators, "predict", None)
-    lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, svc, scaler, 9, 8, 2, (16, 16), 16, divide_by=1)
-    with pytest.raises(InvalidInputError, match="fitted on 6108 features, but these options give 8460"):
-        lesson.find_cars(FRAMES["uint8"], 60, 200, 1, svc, scaler, 9, 8, 2, (32, 32), 32, divide_by=1)
-
-
 @given(
     st.lists(st.tuples(*[st.integers(0, 70)] * 4), max_size=12),
     st.sampled_from([np.float64, np.float32, np.int64, np.uint8]),
@@ -586,6 +542,11 @@ def test_heat_is_added_in_place(values, dtype, threshold):
     assert lesson.add_heat(heat, boxes) is heat
     reference.add_heat(expected, boxes)
     np.testing.assert_array_equal(heat, expected)
+    if dtype == np.float64:
+        decayed = start * 0.9 / 7
+        np.testing.assert_array_equal(
+            lesson.add_heat(decayed.copy(), boxes), reference.add_heat(decayed.copy(), boxes)
+        )
     assert lesson.apply_threshold(heat, threshold) is heat
     np.testing.assert_array_equal(heat, reference.apply_threshold(expected, threshold))
     drawn, expected = (
@@ -593,12 +554,6 @@ def test_heat_is_added_in_place(values, dtype, threshold):
         for module in (lesson, reference)
     )
     np.testing.assert_array_equal(drawn, expected)
-
-
-def test_decayed_heat_keeps_its_fractions():
-    heat = np.full((40, 60), 0.9 / 7)
-    lesson.add_heat(heat, PAIRS)
-    np.testing.assert_array_equal(heat, reference.add_heat(np.full((40, 60), 0.9 / 7), PAIRS))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -707,103 +662,56 @@ def test_labeled_boxes_are_drawn_on_a_part_of_an_image():
         lesson.draw_labeled_bboxes(part, label(heat))
 
 
-def is_vector(length):
-    return lambda value: isinstance(value, np.ndarray) and value.shape == (length,)
-
-
-def is_list_of(count, length):
-    return lambda value: isinstance(value, list) and [len(vector) for vector in value] == [length] * count
-
-
-def is_pair_list(value):
-    return isinstance(value, list) and all(np.shape(pair) == (2, 2) for pair in value)
-
-
-def is_image(value):
-    return isinstance(value, np.ndarray) and value.shape == (208, 330, 3) and value.dtype == np.uint8
-
-
-def is_hog_pair(shape):
-    return lambda value: isinstance(value, tuple) and value[0].shape == shape and value[1].shape == (64, 64)
-
-
 # As in published systems: `d` holds an image, patches, files and a model.
+# As in published systems, where those of `test_course_systems` differ; with the shape of what is returned.
 CALL_FORMS = [
-    ("get_hog_features(d.gray, 9, 8, 2)", is_vector(1764)),
-    ("get_hog_features(d.gray, 9, 8, 2, False, True)", is_vector(1764)),
-    ("get_hog_features(d.gray, 9, 8, 2, feature_vec=False)", lambda value: value.shape == (7, 7, 2, 2, 9)),
-    ("get_hog_features(d.gray, 9, 8, 2, vis=True)", is_hog_pair((1764,))),
-    ("get_hog_features(d.gray, 9, 8, 2, vis=True, feature_vec=False)", is_hog_pair((7, 7, 2, 2, 9))),
-    ("get_hog_features(d.gray, 9, 8, 2, visualise=True, feature_vec=True)", is_hog_pair((1764,))),
-    ("get_hog_features(img=d.gray, orient=9, pix_per_cell=8, cell_per_block=2, vis=False)", is_vector(1764)),
-    ("get_hog_features(d.patch[:, :, 0], 11, 16, 2, vis=False, feature_vec=True)", is_vector(396)),
-    ("get_hog_features(d.gray, 9, 8, 2, transform_sqrt=True)", is_vector(1764)),
-    ("bin_spatial(d.patch)", is_vector(3072)),
-    ("bin_spatial(d.patch, (16, 16))", is_vector(768)),
-    ("bin_spatial(d.patch, size=16)", is_vector(768)),
-    ("bin_spatial(d.patch, 'HSV', (16, 16))", is_vector(768)),
-    ("bin_spatial(d.patch, color_space='HSV', size=(32, 32))", is_vector(3072)),
-    ("color_hist(d.patch)", is_vector(96)),
-    ("color_hist(d.patch, 16)", is_vector(48)),
-    ("color_hist(d.patch, nbins=32, bins_range=(0, 256))", is_vector(96)),
-    ("color_hist(d.float_patch, 32, (0, 1))", is_vector(96)),
-    ("convert_color(d.image, conv='RGB2YCrCb')", is_image),
-    ("convert_color(d.image, 'BGR2YCrCb')", is_image),
-    ("extract_features(d.files)", is_list_of(3, 4932)),
-    ("extract_features(d.files, 'YCrCb', (16, 16), 32, 9, 8, 2, 'ALL', True, True, True)",
-     is_list_of(3, 6156)),
-    ("extract_features(d.files, color_space='YCrCb', spatial_size=(32, 32), hist_bins=32, orient=9, "
-     "pix_per_cell=8, cell_per_block=2, hog_channel='ALL', spatial_feat=True, hist_feat=True, "
-     "hog_feat=True)", is_list_of(3, 8460)),
+    ("get_hog_features(d.gray, 9, 8, 2, False, True)", (1764,)),
+    ("get_hog_features(d.gray, 9, 8, 2, vis=True, feature_vec=False)[0]", (7, 7, 2, 2, 9)),
+    ("get_hog_features(d.gray, 9, 8, 2, visualise=True, feature_vec=True)[1]", (64, 64)),
+    ("get_hog_features(img=d.gray, orient=9, pix_per_cell=8, cell_per_block=2, vis=False)", (1764,)),
+    ("get_hog_features(d.patch[:, :, 0], 11, 16, 2, vis=False, feature_vec=True)", (396,)),
+    ("bin_spatial(d.patch)", (3072,)),
+    ("bin_spatial(d.patch, size=16)", (768,)),
+    ("bin_spatial(d.patch, 'HSV', (16, 16))", (768,)),
+    ("bin_spatial(d.patch, color_space='HSV', size=(32, 32))", (3072,)),
+    ("color_hist(d.patch)", (96,)),
+    ("color_hist(d.patch / 255, 32, (0, 1))", (96,)),
+    ("convert_color(d.image, 'BGR2YCrCb')", (208, 330, 3)),
+    ("extract_features(d.files, 'YCrCb', (16, 16), 32, 9, 8, 2, 'ALL', True, True, True)", (3, 6156)),
     ("extract_features(d.files, cspace='YUV', orient=9, pix_per_cell=8, cell_per_block=2, "
-     "hog_channel='ALL')", is_list_of(3, 5292)),
+     "hog_channel='ALL')", (3, 5292)),
     ("extract_features(d.files, cspace='RGB', spatial_size=(32, 32), hist_bins=32, "
-     "hist_range=(0, 256))", is_list_of(3, 3168)),
-    ("extract_features(d.patches, spatial_feat=False, hist_feat=False)", is_list_of(3, 1764)),
-    ("extract_features(list(d.patches), color_space='HLS', hog_feat=False)", is_list_of(3, 3168)),
-    ("single_img_features(d.patch, color_space='YCrCb', hog_channel='ALL')", is_vector(8460)),
-    ("single_img_features(d.patch, 'YCrCb', (16, 16), 32, 9, 8, 2, 'ALL', True, True, True)",
-     is_vector(6156)),
-    ("slide_window(d.image, [None, None], [90, None], (64, 64), (0.75, 0.75))", is_pair_list),
-    ("slide_window(d.image, x_start_stop=[None, None], y_start_stop=[90, 200], xy_window=(96, 96), "
-     "xy_overlap=(0.5, 0.5))", is_pair_list),
-    ("slide_window(d.image, y_start_stop=(90, 200), xy_window=[48, 48])", is_pair_list),
-    ("draw_boxes(d.image, d.boxes, (0, 0, 255), 6)", is_image),
-    ("draw_boxes(d.image, d.boxes, color=(255, 0, 0), thick=3)", is_image),
-    ("search_windows(d.image, d.boxes, d.svc, d.scaler, 'YCrCb', (16, 16), 16, (0, 256), 9, 8, 2, 'ALL', "
-     "True, True, True)", is_pair_list),
-    ("search_windows(d.image, d.boxes, d.svc, d.scaler, color_space='YCrCb', spatial_size=(16, 16), "
-     "hist_bins=16, orient=9, pix_per_cell=8, cell_per_block=2, hog_channel='ALL', spatial_feat=True, "
-     "hist_feat=True, hog_feat=True)", is_pair_list),
+     "hist_range=(0, 256))", (3, 3168)),
+    ("extract_features(list(d.patches), spatial_feat=False, hist_feat=False)", (3, 1764)),
+    ("single_img_features(d.patch, 'YCrCb', (16, 16), 32, 9, 8, 2, 'ALL', True, True, True)", (6156,)),
+    ("slide_window(d.image, y_start_stop=(90, 200), xy_window=[48, 48])", (36, 2, 2)),
+    ("draw_boxes(d.image, d.boxes, color=(255, 0, 0), thick=3)", (208, 330, 3)),
     ("search_windows(d.image, [], clf=d.svc, scaler=d.scaler, color_space='YCrCb', spatial_size=(16, 16), "
-     "hist_bins=16, hog_channel='ALL')", lambda value: value == []),
-    ("find_cars(d.image, 90, 200, 1.5, d.svc, d.scaler, 9, 8, 2, (16, 16), 16, divide_by=1)", is_image),
+     "hist_bins=16, hog_channel='ALL')", (0,)),
     ("find_cars(img=d.image, ystart=90, ystop=200, scale=1, svc=d.svc, X_scaler=d.scaler, orient=9, "
-     "pix_per_cell=8, cell_per_block=2, spatial_size=(16, 16), hist_bins=16, divide_by=1)", is_image),
-    ("find_car_windows(d.image, 90, 200, 1.0, d.svc, d.scaler, 9, 8, 2, (16, 16), 16, divide_by=1)",
-     is_pair_list),
-    ("find_car_windows(d.image, None, None, 1.0, d.svc, d.scaler, 9, 8, 2, (16, 16), 16, divide_by=1, "
-     "color_space='YCrCb')", is_pair_list),
-    ("add_heat(d.heat, d.boxes)", lambda value: value.shape == (208, 330)),
-    ("apply_threshold(heatmap=d.heat, threshold=2)", lambda value: value.shape == (208, 330)),
-    ("draw_labeled_bboxes(np.copy(d.image), labels=d.labels)", is_image),
+     "pix_per_cell=8, cell_per_block=2, spatial_size=(16, 16), hist_bins=16, divide_by=1)", (208, 330, 3)),
+    ("find_car_windows(d.image, 0, 60, 1, d.svc, d.scaler, 9, 8, 2, 16, 16, divide_by=1)", (0,)),
+    ("find_car_windows(d.image, 0, 200, 500.0, d.svc, d.scaler, 9, 8, 2, 16, 16, divide_by=1)", (0,)),
+    ("apply_threshold(heatmap=d.heat, threshold=2)", (208, 330)),
+    ("draw_labeled_bboxes(np.copy(d.image), labels=d.labels)", (208, 330, 3)),
 ]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def call_data(models, files):
     svc, scaler = models["all", "uint8"].model
-    heat = reference.add_heat(np.zeros((208, 330)), PAIRS)
+    image, heat = FRAMES["uint8"].copy(), reference.add_heat(np.zeros((208, 330)), PAIRS)
+    image.setflags(write=False)
     return SimpleNamespace(
-        image=FRAMES["uint8"], patch=PATCHES[0], patches=PATCHES[:3], gray=PATCHES[0][..., 1],
+        image=image, patch=PATCHES[0], patches=PATCHES[:3], gray=PATCHES[0][..., 1],
         float_patch=PATCHES[0].astype(np.float32) / 255, files=sorted(map(str, files.glob("*.jpg")))[:3],
         svc=svc, scaler=scaler, boxes=PAIRS, heat=heat, labels=label(heat),
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("form", "is_right"), CALL_FORMS, ids=[form[:60] for form, _ in CALL_FORMS])
-def test_every_call_form_binds(call_data, form, is_right):
-    assert is_right(eval(form, {**vars(lesson), "np": np, "d": call_data}))
+@pytest.mark.parametrize(("form", "shape"), CALL_FORMS, ids=[form[:60] for form, _ in CALL_FORMS])
+def test_every_call_form_binds(call_data, form, shape):
+    assert np.shape(eval(form, {**vars(lesson), "np": np, "d": call_data})) == shape
 
 
 @pytest.mark.parametrize(
@@ -811,7 +719,6 @@ def test_every_call_form_binds(call_data, form, is_right):
     [
         ("get_hog_features(d.patch, 9, 8, 2)", "one .H, W. channel"),
         ("get_hog_features(d.gray[:9], 9, 8, 2)", "at least one block large .16x16 pixels.; got 64x9"),
-        ("get_hog_features(d.gray, 9, (8, 8), 2)", "pix_per_cell must be an integer"),
         (
             "get_hog_features(-d.float_patch[..., 0], 9, 8, 2, transform_sqrt=True)",
             "transform_sqrt must be False",
@@ -819,13 +726,10 @@ def test_every_call_form_binds(call_data, form, is_right):
         ("bin_spatial(d.gray, 'HLS', 8)", "color_space must be RGB for one channel; got 'HLS'"),
         ("bin_spatial(d.patch, (1, 2, 3))", "size must be"),
         ("bin_spatial(d.patch, 8, 8)", "takes an image and a size; got 1 more"),
-        ("bin_spatial(d.patch, order='rgb')", "order must be one of"),
-        ("color_hist(d.patch, 0)", "nbins must be an integer"),
         ("color_hist(d.patch, 4, (5, 5))", "bins_range must be a number, greater than 5"),
         ("color_hist(d.patch, 4, 256)", "bins_range must be .low, high."),
         ("color_hist(d.patch.astype(int))", "must be uint8 or float"),
         ("convert_color(d.patch, 'RGB2CMYK')", "conv must be"),
-        ("convert_color(d.patch, 'GRAY2RGB')", "conv must be"),
         ("extract_features('car.png')", "list of file names"),
         ("extract_features(d.patch)", r"list of images, .*pass \[image\], or use single_img_features"),
         ("extract_features([d.patch, d.gray])", r"imgs\[1\] must be an .H, W, 3. RGB array"),
@@ -835,7 +739,6 @@ def test_every_call_form_binds(call_data, form, is_right):
             "HOG quiz .*: cspace='YCrCb', orient=9, pix_per_cell=8, cell_per_block=2, hog_channel=1",
         ),
         ("extract_features(['missing.png'])", "does not exist"),
-        ("extract_features(d.files, 'YIQ')", "color_space must be one of"),
         ("extract_features(d.files, hog_channel=3)", "hog_channel must be one of"),
         ("extract_features(d.files, spatial_feat=0, hist_feat=0, hog_feat=0)", "all False"),
         ("slide_window((720, 1280))", "img must be an image"),
@@ -843,44 +746,27 @@ def test_every_call_form_binds(call_data, form, is_right):
         ("slide_window(d.image, [9, 5])", "0 <= start <= stop"),
         ("slide_window(d.image, xy_window=64)", "xy_window must be a pair"),
         ("slide_window(d.image, xy_overlap=(0.5, 1))", "xy_overlap must leave a step"),
-        ("slide_window(d.image, formula='newer')", "formula must be one of"),
         ("search_windows(d.image, [((0, 0), (0, 9))], d.svc, d.scaler, **d.options)", "non-empty"),
         ("search_windows(d.image, [((330, 0), (340, 9))], d.svc, d.scaler, **d.options)", "330x208 image"),
         ("search_windows(d.image, [[1, 2, 3]], d.svc, d.scaler, **d.options)", "corner pairs"),
         ("search_windows(d.image, d.boxes, d.svc, d.scaler)", "fitted on 6108 features, but these options"),
-        (
-            "search_windows(d.image, d.boxes, d.scaler, d.svc, **d.options)",
-            "classifier must have a method predict",
-        ),
+        ("search_windows(d.image, d.boxes, d.scaler, d.svc)", "classifier must have a method predict"),
         (
             "find_cars(d.image, 90, 200, 1, d.svc, StandardScaler(), 9, 8, 2, 16, 16)",
-            "scaler must be fitted; got an unfitted StandardScaler: call fit first",
+            "scaler must be fitted; got an unfitted StandardScaler",
         ),
         ("find_cars(d.image, 90, 90, 1, d.svc, d.scaler, 9, 8, 2, 16, 16)", "ystart and ystop"),
         ("find_cars(d.image, 90, 200, 0, d.svc, d.scaler, 9, 8, 2, 16, 16)", "scale must be a number"),
         ("find_cars(d.image, 90, 200, 1, d.svc, d.scaler, 9, 64, 2, 16, 16)", "must fit into a window"),
-        (
-            "find_cars(d.image, 90, 200, 1, d.svc, d.scaler, 9, 8, 2, 16, 16, resize='first')",
-            "resize must be",
-        ),
-        (
-            "find_cars(d.image, 90, 200, 1, d.svc, d.scaler, 9, 8, 2, 16, 16, cells_per_step=0)",
-            "cells_per_step",
-        ),
+        ("find_cars(d.image, 9, 99, 1, d.svc, d.scaler, 9, 8, 2, 16, 16, resize='first')", "resize must be"),
         ("add_heat(d.patch, d.boxes)", "heatmap must be an"),
-        ("add_heat(d.read_only, d.boxes)", "heatmap must be writable"),
         ("add_heat(d.heat, [((9, 9), (5, 5))])", "x1 <= x2"),
-        ("add_heat(d.heat, [((9, np.nan), (5, 5))])", "corner pairs"),
         *(
-            (
-                f"add_heat(d.heat, {boxes})",
-                "bbox_list must be .*find_cars returns a picture, find_car_windows",
-            )
-            for boxes in ("d.image", "list(d.image)", "[*d.boxes, *d.image]", "[d.image]", "iter(d.image)")
+            (f"add_heat(d.heat, {boxes})", "bbox_list must be .*find_cars returns a picture, find_car_w")
+            for boxes in ("d.image", "list(d.image)", "[*d.boxes, *d.image]", "iter(d.image)")
         ),
         ("draw_boxes(d.image, d.image)", "bboxes must be .*find_car_windows returns the boxes"),
         ("draw_boxes(d.image[..., [0, 1, 2, 0]], [])", r"drop the alpha channel with img\[\.\.\., :3\]"),
-        ("apply_threshold(d.heat, None)", "threshold must be a number"),
         ("draw_boxes(d.image, d.boxes, color='red')", "color must be"),
         ("draw_boxes(d.image, d.boxes, thick=1.5)", "thick must be an integer"),
         ("draw_labeled_bboxes(d.image[:, ::-1], d.labels)", "writable and contiguous"),
@@ -888,10 +774,7 @@ def test_every_call_form_binds(call_data, form, is_right):
     ],
 )
 def test_bad_input_raises_an_error_of_the_library(call_data, models, form, message):
-    data = SimpleNamespace(
-        **vars(call_data), options=models["all", "uint8"].options, read_only=np.zeros((4, 4))
-    )
-    data.read_only.setflags(write=False)
+    data = SimpleNamespace(**vars(call_data), options=models["all", "uint8"].options)
     with pytest.raises(InvalidInputError, match=message):
         eval(form, {**vars(lesson), "np": np, "StandardScaler": StandardScaler, "d": data})
 
@@ -901,22 +784,6 @@ def test_an_unknown_option_names_the_function_that_was_called(models):
         lesson.find_cars(
             FRAMES["uint8"], 0, 90, 1, *models["all", "uint8"].model, 9, 8, 2, 16, 16, draw=False
         )
-
-
-def test_a_band_without_room_for_a_window(models):
-    case = models["all", "uint8"]
-    for rows, scale in ((60, 1), (200, 9.0), (200, 500.0)):
-        arguments = (FRAMES["uint8"], 0, rows, scale, *case.model, 9, 8, 2, (16, 16), 16)
-        assert lesson.find_car_windows(*arguments, divide_by=1) == []
-
-
-def test_inputs_are_left_as_they_were(models):
-    case, image = models["all", "uint8"], FRAMES["uint8"].copy()
-    image.setflags(write=False)
-    lesson.find_cars(image, 60, 200, 1.5, *case.model, 9, 8, 2, (16, 16), 16, divide_by=1)
-    lesson.search_windows(image, PAIRS, *case.model, **case.options)
-    lesson.draw_boxes(image, PAIRS)
-    np.testing.assert_array_equal(image, FRAMES["uint8"])
 
 
 def test_features_of_an_image_with_a_picture_of_the_hog():
@@ -969,22 +836,6 @@ def test_labels_of_any_kind_and_number():
         InvalidInputError, match=r"must predict a label for each of .* from Constant\.predict"
     ):
         lesson.find_car_windows(frame, 0, 80, 1, Constant(), None, 9, 8, 2, (32, 32), 32, divide_by=1)
-
-
-def test_a_replaced_method_of_a_classifier_counts(models):
-    case = models["all", "uint8"]
-    svc, scaler = copy.deepcopy(case.model)
-    svc.predict = lambda features: np.zeros(len(features))
-    assert lesson.search_windows(FRAMES["uint8"], PAIRS, svc, scaler, **case.options) == []
-
-
-@pytest.mark.parametrize("space", ["HLS", "HSV", "LUV", "LAB"])
-def test_a_mismatch_warns_in_every_color_space(space):
-    options = {"color_space": space, "spatial_size": (16, 16), "hist_bins": 16}
-    for trained_on, given_as in ((PATCHES.astype(np.float32) / 255, "uint8"), (PATCHES, "0-1")):
-        svc, scaler = trained(np.array(lesson.extract_features(trained_on, **options)))
-        with pytest.warns(UserWarning, match="the scaler was fitted on values 0-"):
-            lesson.search_windows(FRAMES[given_as], PAIRS, svc, scaler, **options)
 
 
 @pytest.mark.parametrize("options", [{"spatial_size": (16, 32)}, {}])

@@ -88,10 +88,13 @@ def test_it_keeps_the_defaults_of_its_construction(estimators):
     assert found.tolist() != other.tolist() or isinstance(estimators[0], GaussianNB)
 
 
-def test_calling_it_draws_in_the_style_of_the_course():
+def test_calling_it_draws_in_the_style_of_the_course(tmp_path):
     scene = render_scene(shape=(540, 960), random_state=3)
     frame = cv2.resize(scene.image, (1280, 720))
     detector = HeatmapDetector()
+    assert detector.heatmap is None
+    with pytest.raises(InvalidInputError, match="labels need a frame"):
+        _ = detector.labels
     drawn = detector(frame)
     boxes = detector.detect(frame).boxes
     assert len(boxes)
@@ -99,26 +102,11 @@ def test_calling_it_draws_in_the_style_of_the_course():
     labels = detector.labels
     assert labels[0].shape == frame.shape[:2]
     assert labels[1] == len(boxes)
-    # The lesson draws the last pixel of a region, the library the end of the half-open box.
-    assert lesson.draw_labeled_bboxes(frame.copy(), labels).shape == frame.shape
-
-
-def test_it_is_a_detector_like_others(tmp_path, patches):
-    clip = write_clip(tmp_path / "clip.mp4", [frame_of(patches, shift) for shift in range(6)], fps="25")
-    report = process_video(clip, tmp_path / "out.mp4", HeatmapDetector(threshold=0))
-    assert report.frames == 6
-
-
-def test_it_starts_without_heat():
-    detector = HeatmapDetector()
-    assert detector.heatmap is None
-    with pytest.raises(InvalidInputError, match="labels need a frame"):
-        _ = detector.labels
-    frame = np.full((720, 1280, 3), 90, np.uint8)
-    detector(frame)
     assert detector.heatmap.shape == (720, 1280)
     detector.reset()
     assert detector.heatmap is None
+    clip = write_clip(tmp_path / "clip.mp4", [scene.image] * 6, fps="25")
+    assert process_video(clip, tmp_path / "out.mp4", detector).frames == 6
 
 
 def test_the_threshold_fits_the_density():

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import FeatureParams
+from vehicle_detection.features import FeatureParams, extract_features, single_img_features
 from vehicle_detection.function_model import FunctionParams
 from vehicle_detection.heatmap import HeatParams, heat_range
 from vehicle_detection.network import NetworkParams
@@ -17,6 +17,7 @@ from vehicle_detection.search import PixelBand, SearchBand, SearchParams
 from vehicle_detection.tracking import TrackParams
 from vehicle_detection.windows import band_windows
 
+PARTS = ("spatial_feat", "hist_feat", "hog_feat")
 BAND = SearchBand(window=(64, 64), y=(0, 256))
 SEARCH = SearchParams(bands=(BAND,), horizon=0.5)
 ALL = [FeatureParams(), BAND, SEARCH, HeatParams(), RegionParams(), TrackParams()]
@@ -55,24 +56,48 @@ def test_every_field_is_checked_and_named(params, field, value):
 
 
 @pytest.mark.parametrize(
-    ("name", "length", "parts"),
+    ("params", "parts"),
     [
-        ("luv-2384", 2384, (768, 48, 1568)),
-        ("ycrcb-6156", 6156, (768, 96, 5292)),
-        ("ycrcb-8460", 8460, (3072, 96, 5292)),
-        ("lab-9432", 9432, (3072, 96, 5292 + 972)),
+        (FeatureParams.preset("luv-2384"), (768, 48, 1568)),
+        (FeatureParams.preset("ycrcb-6156"), (768, 96, 5292)),
+        (FeatureParams.preset("ycrcb-8460"), (3072, 96, 5292)),
+        (FeatureParams.preset("lab-9432"), (3072, 96, 5292 + 972)),
+        (FeatureParams(spatial_feat=False, hist_feat=False), (0, 0, 5292)),
+        (FeatureParams(spatial_size=(16, 16), hog_feat=False), (768, 96, 0)),
+    ],
+    ids=str,
+)
+def test_features_have_the_known_lengths(params, parts):
+    assert (params.spatial_length, params.hist_length, params.hog_length) == parts
+    assert params.length == sum(parts)
+    patch = np.zeros((1, 64, 64, 3), np.uint8)
+    assert extract_features(patch, params).shape == (1, params.length)
+    assert single_img_features(patch[0], params).shape == (params.length,)
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "message"),
+    [
+        (FeatureParams, {"hog_channel": 3}, "hog_channel must be one of 0, 1, 2, 'ALL', 'GRAY'"),
+        (FeatureParams, {"spatial_size": (32, 16)}, "spatial_size must be an integer from 1 to 64"),
+        (FeatureParams, dict.fromkeys(PARTS, False), "all False; set one to True"),
+        (FeatureParams, {"pix_per_cell": 16, "cell_per_block": 5}, "cell_per_block must be .* from 1 to 4"),
+        (FeatureParams, {"coarse_hog": True, "cell_per_block": 5}, "coarse_hog must be False, because a bl"),
+        (FeatureParams.preset, {"name": "nothing"}, "preset must be one of '"),
+        (SearchParams.preset, {"name": ["default"]}, "preset must be one of '"),
+        (SearchBand, {"window": (64, 4), "y": (0, 9)}, r"window\[1\] must be a number, at least"),
+        (SearchBand, {"window": (64, 64), "y": (10, 10)}, r"y must be .* start < stop; got \(10, 10\)"),
+        (SearchBand, {"window": (64, 64), "y": (0, 9), "x": (0, 1280)}, r"x\[1\] must be .* at most 1"),
+        (SearchParams, {"bands": ()}, "bands must be a tuple of SearchBand"),
+        (SearchParams, {"bands": (BAND, "band")}, "bands must be a tuple of SearchBand"),
+        (SEARCH.with_horizon, {"horizon": 1.2}, "horizon must be a number, at least 0 and at most 1"),
+        (TrackParams, {"show_coast": 2, "max_coast": 1}, "show_coast must be at most max_coast, .*got 2 and"),
+        (FunctionParams, {"min_score": None}, "min_score must be a number"),
     ],
 )
-def test_feature_presets_have_the_known_lengths(name, length, parts):
-    params = FeatureParams.preset(name)
-    assert params.length == length
-    assert (params.spatial_length, params.hist_length, params.hog_length) == parts
-
-
-def test_disabled_features_have_no_length():
-    params = FeatureParams(spatial_feat=False, hist_feat=False)
-    assert params.length == params.hog_length == 5292
-    assert FeatureParams(hog_feat=False).length == 768 + 96
+def test_invalid_parameters_are_rejected(kind, arguments, message):
+    with pytest.raises(InvalidInputError, match=message):
+        kind(**arguments)
 
 
 def test_coarse_hog_is_the_last_part_of_hog():
@@ -93,25 +118,6 @@ def test_gains_apply_to_their_parts():
     assert (FeatureParams().gains == 1).all()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"hog_channel": 3}, "hog_channel must be one of 0, 1, 2, 'ALL', 'GRAY'"),
-        ({"spatial_size": (32, 16)}, "spatial_size must be an integer from 1 to 64"),
-        ({"spatial_feat": False, "hist_feat": False, "hog_feat": False}, "all False; set one to True"),
-        ({"pix_per_cell": 16, "cell_per_block": 5}, "cell_per_block must be an integer from 1 to 4"),
-        ({"coarse_hog": True, "cell_per_block": 5}, "coarse_hog must be False, because a block of 5 cells"),
-    ],
-)
-def test_invalid_feature_params_are_rejected(arguments, message):
-    with pytest.raises(InvalidInputError, match=message):
-        FeatureParams(**arguments)
-
-
-def test_the_spatial_size_may_be_a_square_pair():
-    assert FeatureParams(spatial_size=(16, 16)) == FeatureParams(spatial_size=16)
-
-
 def test_the_color_spaces_of_the_parts():
     params = FeatureParams(color_space="LUV", hist_color_space="HSV", spatial_feat=False)
     assert (params.spatial_space, params.hist_space) == ("LUV", "HSV")
@@ -119,47 +125,11 @@ def test_the_color_spaces_of_the_parts():
     assert FeatureParams(hog_channel="GRAY", spatial_color_space="HLS").used_color_spaces == {"HLS", "YCrCb"}
 
 
-@pytest.mark.parametrize("cls", [FeatureParams, SearchParams])
-@pytest.mark.parametrize("name", ["nothing", None, ["default"]])
-def test_an_unknown_preset_is_rejected(cls, name):
-    with pytest.raises(InvalidInputError, match="preset must be one of '"):
-        cls.preset(name)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"window": (64, 4)}, r"window\[1\] must be a number, at least"),
-        ({"y": (10, 10)}, r"y must be \(start, stop\) with start < stop; got \(10, 10\)"),
-        ({"x": (0, 1280)}, r"x\[1\] must be a number, at least 0 and at most 1"),
-        ({"overlap": (0.5, math.nan)}, r"overlap\[1\] must be a number"),
-    ],
-)
-def test_invalid_bands_are_rejected(arguments, message):
-    with pytest.raises(InvalidInputError, match=message):
-        dataclasses.replace(BAND, **arguments)
-
-
-def test_search_params_check_and_normalize_bands():
-    for bands in ((), [], (BAND, "band"), 5, BAND):
-        with pytest.raises(InvalidInputError, match="bands must be a tuple of SearchBand"):
-            SearchParams(bands=bands)
-    assert SearchParams(bands=[BAND], horizon=0.5) == SEARCH
-
-
-def test_show_coast_is_at_most_max_coast():
-    with pytest.raises(InvalidInputError, match=r"show_coast must be at most max_coast, .*got 2 and 1"):
-        TrackParams(show_coast=2, max_coast=1)
-
-
-def test_with_horizon():
-    assert SEARCH.with_horizon(None) is SEARCH
-    assert SEARCH.with_horizon(0.3) == dataclasses.replace(SEARCH, horizon=0.3)
-    with pytest.raises(InvalidInputError, match="horizon must be a number, at least 0 and at most 1"):
-        SEARCH.with_horizon(1.2)
-
-
 def test_a_band_is_relative_to_the_horizon():
+    assert SearchParams(bands=[BAND], horizon=0.5) == SEARCH
+    assert SEARCH.with_horizon(None) is SEARCH
+    everywhere = SearchParams.default().everywhere()
+    assert {(band.y1, band.y2) for band in everywhere.place((720, 1280))} == {(0, 720)}
     params = SearchParams(bands=(SearchBand(window=(96, 48), y=(-20, 200), overlap=(0.5, 0.75)),))
     (band,) = params.with_horizon(0.5).place((720, 1280, 3))
     assert band == PixelBand(0, 340, 1280, 560, (96, 48), (48, 12))
@@ -173,11 +143,11 @@ def test_a_band_scales_with_the_frame():
     assert half == PixelBand(
         *(value // 2 for value in (full.x1, full.y1, full.x2, full.y2)), (32, 32), (4, 4)
     )
-
-
-def test_a_portrait_frame_scales_by_its_longer_side():
-    (band,) = SEARCH.place((1280, 720))
-    assert band == PixelBand(0, 640, 720, 896, (64, 64), (8, 8))
+    # A portrait frame scales by its longer side.
+    assert SEARCH.place((1280, 720)) == (PixelBand(0, 640, 720, 896, (64, 64), (8, 8)),)
+    bands = SearchParams.preset("three-scales").place((720, 1280))
+    assert [band.window for band in bands] == [(96, 96), (64, 64), (51, 51)]
+    assert {(band.x1, band.y1, band.x2, band.y2) for band in bands} == {(0, 400, 1280, 656)}
 
 
 def test_bands_without_room_for_a_window_are_omitted():
@@ -245,25 +215,6 @@ def test_a_tiny_frame_is_rejected(shape, preset):
         SearchParams.preset(preset).place(shape)
 
 
-def test_the_window_list_of_the_first_system():
-    bands = SearchParams.preset("130-windows").place((720, 1280))
-    placed = [(band.window, band.x1, band.x2, band.y1, band.y2) for band in bands]
-    assert placed == [
-        ((96, 96), 650, 1280, 395, 530),
-        ((110, 145), 650, 1280, 380, 590),
-        ((155, 165), 650, 1280, 370, 590),
-        ((170, 200), 650, 1280, 400, 700),
-    ]
-    # The windows that fit; the lesson's slide_window also lists 16 that extend beyond the regions.
-    assert [len(band_windows(band)) for band in bands] == [60, 32, 8, 14]
-
-
-def test_the_bands_of_the_third_system():
-    bands = SearchParams.preset("three-scales").place((720, 1280))
-    assert [band.window for band in bands] == [(96, 96), (64, 64), (51, 51)]
-    assert {(band.x1, band.y1, band.x2, band.y2) for band in bands} == {(0, 400, 1280, 656)}
-
-
 WHOLE = HeatParams(weighting="count", peak_fraction=0)
 
 
@@ -303,11 +254,6 @@ def test_a_given_heat_threshold_is_kept_and_checked_against_the_density():
             assert params.for_search(search) is params
     for search in (FunctionParams(), NetworkParams()):
         assert heat_range(search, WHOLE).high == np.inf
-
-
-def test_everywhere_searches_all_rows():
-    everywhere = SearchParams.default().everywhere()
-    assert {(band.y1, band.y2) for band in everywhere.place((720, 1280))} == {(0, 720)}
 
 
 def test_values_of_numpy_become_those_of_python():

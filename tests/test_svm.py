@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import save
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.linear_model import LogisticRegression
 from sklearn.model_selection import GridSearchCV
@@ -15,7 +16,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
-from tests.helpers import random_classifier, random_template
+from tests.helpers import random_classifier
 from vehicle_detection._common import FORMAT_VERSION, blur_patches, degrade_patches, mirror_patches
 from vehicle_detection._common.model_file import FORMAT, checksum
 from vehicle_detection._kernels import fit_svm
@@ -59,6 +60,31 @@ def test_a_trained_classifier_separates_its_patches(trained, patches, labels):
     np.testing.assert_array_equal(predicted, labels)
     assert trained.score(patches, labels) == 1.0
     assert trained.score(patches, 1 - labels) == 0.0
+    features = extract_features(patches, SMALL)
+    np.testing.assert_array_equal(trained.decision_function(features), scores)
+    np.testing.assert_allclose(trained.decision_function(list(patches[:3])), scores[:3], rtol=1e-6)
+    assert trained.decision_function(features[:0]).shape == (0,)
+    template = trained.templates[0]
+    expected = ((features - template.mean) / template.scale) @ template.coef + template.intercept
+    np.testing.assert_allclose(scores, expected, atol=1e-9)
+    for X, y in ((patches, [1]), (patches, np.ones((80, 1))), (patches, 1), (features[:0], [])):
+        with pytest.raises(InvalidInputError, match=rf"y must hold one label for each of {len(X)} rows"):
+            trained.score(X, y)
+    training = trained.metadata["training"]
+    assert (training["vehicles"], training["non_vehicles"], training["random_state"]) == (40, 40, 0)
+    assert {"vehicle_detection", "numpy", "numba"} <= trained.metadata["versions"].keys()
+    assert trained.metadata["accuracy"] == 1.0
+
+
+def test_to_a_pipeline_and_back(trained, patches):
+    pipeline = to_pipeline(trained)
+    scores = trained.decision_function(patches)
+    # The pipeline scales in float32, as the features are.
+    np.testing.assert_allclose(pipeline.decision_function(patches), scores, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(pipeline.predict(patches), trained.predict(patches))
+    again = VehicleClassifier.from_pipeline(pipeline, SMALL, metadata=trained.metadata)
+    np.testing.assert_array_equal(again.decision_function(patches), scores)
+    assert (again.params, again.metadata) == (trained.params, trained.metadata)
 
 
 def test_gains_multiply_the_scaled_features(patches, labels):
@@ -110,14 +136,6 @@ def test_degraded_copies_have_their_weight(patches, labels):
     assert (training["degraded"], training["vehicles"], training["non_vehicles"]) == (0.2, 40, 40)
 
 
-def test_scores_are_those_of_linear_svc_behind_a_scaler(patches, labels):
-    found = train_classifier(patches, labels, params=SMALL, options=TrainingOptions(C=0.01, mirror=False))
-    pipeline = make_pipeline(StandardScaler(), LinearSVC(C=0.01, tol=1e-6, random_state=0, max_iter=10_000))
-    features = extract_features(patches, SMALL)
-    expected = pipeline.fit(features, labels).decision_function(features)
-    np.testing.assert_allclose(found.decision_function(features), expected, atol=3e-3)
-
-
 @pytest.mark.parametrize("options", [{}, {"gamma": 0.4, "degraded": 0.2}], ids=str)
 def test_any_linear_estimator(patches, labels, options):
     estimator = LogisticRegression(C=1e-3)
@@ -133,9 +151,6 @@ def test_any_linear_estimator(patches, labels, options):
     )
     assert not hasattr(estimator, "coef_")
     assert found.metadata["training"]["estimator"] == "LogisticRegression(C=0.001)"
-
-
-def test_a_grid_search_as_the_estimator(patches, labels):
     grid = GridSearchCV(LinearSVC(random_state=0), {"C": [1e-2]}, cv=2)
     found = train_classifier(patches, labels, params=SMALL, estimator=grid)
     expected = train_classifier(patches, labels, params=SMALL, options=TrainingOptions(C=1e-2))
@@ -187,30 +202,6 @@ def test_the_forms_of_training_patches(patches, labels, tmp_path):
         train_classifier(("vehicles", "non-vehicles"), params=SMALL)
 
 
-def test_saving_and_loading_keeps_the_features(tmp_path):
-    params = FeatureParams.preset("lab-9432")
-    random_classifier(params).save(tmp_path / "a.safetensors")
-    assert load_classifier(tmp_path / "a.safetensors").params == params
-
-
-def test_patches_and_their_features_have_the_same_score(trained, patches):
-    features = extract_features(patches, SMALL)
-    np.testing.assert_array_equal(trained.decision_function(features), trained.decision_function(patches))
-    np.testing.assert_allclose(
-        trained.decision_function(list(patches[:3])), trained.decision_function(patches)[:3], rtol=1e-6
-    )
-    assert trained.decision_function(features[:0]).shape == (0,)
-
-
-def test_metadata_of_training(trained):
-    training = trained.metadata["training"]
-    assert (training["vehicles"], training["non_vehicles"]) == (40, 40)
-    assert training["random_state"] == 0
-    assert {"vehicle_detection", "numpy", "numba"} <= trained.metadata["versions"].keys()
-    assert trained.metadata["accuracy"] == 1.0
-    json.dumps(trained.metadata)
-
-
 def test_the_same_seed_gives_the_same_model(trained, patches, labels, tmp_path):
     before = patches.copy()
     again = train_classifier(patches, labels, params=SMALL, metadata={"accuracy": 1.0}, jobs=1)
@@ -229,7 +220,7 @@ def test_mirrored_patches_make_a_mirror_symmetric_scaler(patches, labels):
     assert not np.allclose(alone.templates[0].mean, both.templates[0].mean)
 
 
-@pytest.mark.parametrize("kind", [int, float, bool, np.uint8, list])
+@pytest.mark.parametrize("kind", [float, bool, np.uint8, list])
 def test_labels_of_any_number_type(patches, labels, trained, kind):
     some = slice(30, 50)
     given = labels[some].tolist() if kind is list else labels[some].astype(kind)
@@ -242,13 +233,9 @@ def test_labels_of_any_number_type(patches, labels, trained, kind):
     ("bad", "message"),
     [
         (np.ones(80), r"labels must hold both classes: vehicles \(1\) and non-vehicles \(0\)"),
-        (np.zeros(80, int), "labels must hold both classes"),
         (np.repeat([1, np.nan], 40), r"labels must be 0 or 1; got \[1.0, nan\]"),
         (np.repeat([1, -1], 40), r"labels must be 0 or 1; got \[-1, 1\]"),
-        (np.repeat([1, 2], 40), "labels must be 0 or 1"),
-        (np.repeat([0.5, 1], 40), "labels must be 0 or 1"),
         (np.repeat([1, 0], 39), "labels must hold one number for each of 80 patches; got an array of shape"),
-        (np.repeat([1, 0], 40)[:, None], "labels must hold one number for each of 80 patches"),
         (np.repeat(["car", "road"], 40), "labels must hold one number for each of 80 patches"),
         (None, r"labels must be given, unless patches is a PatchSet or a pair \(cars, notcars\)"),
     ],
@@ -261,9 +248,7 @@ def test_bad_labels(patches, bad, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda p: p[:, :32, :32], r"patches must be an \(N, 64, 64, 3\) uint8 RGB array"),
         (lambda p: p / 255, r"patches must be an \(N, 64, 64, 3\) uint8 RGB array .* dtype float64"),
-        (lambda p: p[..., 0], r"patches must be an \(N, 64, 64, 3\) uint8 RGB array"),
         (lambda p: [*p[:-1], p[-1, :32, :32]], r"patches\[79\] must be 64x64 pixels, got 32x32"),
         (lambda p: [*p[:-1], p[-1] / 255], r"patches\[79\] must be an \(H, W, 3\) uint8 RGB array"),
     ],
@@ -271,11 +256,6 @@ def test_bad_labels(patches, bad, message):
 def test_bad_patches(patches, labels, change, message):
     with pytest.raises(InvalidInputError, match=message):
         train_classifier(change(patches), labels, params=SMALL)
-
-
-def test_no_patches():
-    with pytest.raises(InvalidInputError, match="labels must hold both classes"):
-        train_classifier(np.empty((0, 64, 64, 3), np.uint8), [])
 
 
 @pytest.mark.parametrize(
@@ -299,11 +279,8 @@ def test_bad_options(options, message):
     ("X", "message"),
     [
         (np.zeros((2, 5)), r"X must be \(N, \d+\) features or \(N, 64, 64, 3\) patches; got .*\(2, 5\)"),
-        (np.zeros(SMALL.length), r"X must be \(N, \d+\) features"),
         (np.zeros((1, SMALL.length), complex), "X must be"),
         (np.full((1, SMALL.length), np.nan), "X must be finite, got NaN or infinity"),
-        (np.full((1, SMALL.length), np.inf), "X must be finite, got NaN or infinity"),
-        (np.zeros((2, 32, 32, 3), np.uint8), r"X must be an \(N, 64, 64, 3\) uint8 RGB array"),
         (np.zeros((2, 64, 64, 3)), r"X must be an \(N, 64, 64, 3\) uint8 RGB array .*float64"),
         ("patches", "X must be"),
     ],
@@ -311,27 +288,6 @@ def test_bad_options(options, message):
 def test_bad_rows(trained, X, message):
     with pytest.raises(InvalidInputError, match=message):
         trained.decision_function(X)
-
-
-@pytest.mark.parametrize("y", [[1], np.ones((80, 1)), 1, np.ones(79)])
-def test_score_needs_a_label_for_each_row(trained, patches, y):
-    with pytest.raises(InvalidInputError, match="y must hold one label for each of 80 rows"):
-        trained.score(patches, y)
-
-
-def test_score_without_patches(trained):
-    with pytest.raises(
-        InvalidInputError, match="y must hold one label for each of 0 rows \\(at least one\\)"
-    ):
-        trained.score(np.empty((0, SMALL.length)), [])
-
-
-def test_folding_combines_scaler_and_svm():
-    template = random_template(SMALL, 3, bias=0.7)
-    x = np.random.default_rng(0).uniform(0, 200, (5, SMALL.length))
-    weights, bias = template.fold()
-    expected = ((x - template.mean) / template.scale) @ template.coef + template.intercept
-    np.testing.assert_allclose(x @ weights + bias, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_several_templates_give_the_maximum_score():
@@ -346,24 +302,15 @@ def test_several_templates_give_the_maximum_score():
         to_pipeline(many)
 
 
-def test_a_template_is_a_read_only_copy():
-    mean = np.zeros(4)
-    template = Template(mean, np.ones(4), np.ones(4), 0.0)
-    mean[0] = 5
-    assert template.mean[0] == 0
-    with pytest.raises(ValueError, match="read-only"):
-        template.coef[0] = 2
-
-
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
         ((np.zeros(4), np.ones(3), np.ones(4), 0.0), "scale must be a vector of the features' length"),
         ((np.zeros((2, 2)), np.ones(4), np.ones(4), 0.0), "mean must be a vector"),
         ((np.zeros(4), np.ones(4), np.full(4, np.nan), 0.0), "coef must be finite, got NaN or infinity"),
-        ((np.zeros(4), np.zeros(4), np.ones(4), 0.0), "scale must be positive"),
         ((np.zeros(4), -np.ones(4), np.ones(4), 0.0), "scale must be positive"),
         ((np.zeros(4), np.ones(4), np.ones(4), np.inf), "intercept must be a number, finite; got inf"),
+        ((np.zeros(4), np.full(4, 1e-300), np.full(4, 1e300), 0.0), "coef must be of the order of scale"),
     ],
 )
 def test_invalid_templates(columns, message):
@@ -371,33 +318,24 @@ def test_invalid_templates(columns, message):
         Template(*columns)
 
 
-def test_templates_that_do_not_match_the_params():
-    with pytest.raises(InvalidInputError, match="templates must hold at least one template; got none"):
-        VehicleClassifier(SMALL, ())
-    with pytest.raises(InvalidInputError, match="templates must be a Template, got 'abc'; load_classifier"):
-        VehicleClassifier(SMALL, ("abc",))
-    with pytest.raises(InvalidInputError, match=rf"templates must have {SMALL.length} weights, .* got 4"):
-        VehicleClassifier(SMALL, (Template(np.zeros(4), np.ones(4), np.ones(4), 0.0),))
-
-
-def test_scores_equal_those_of_the_pipeline(trained, patches):
-    pipeline = to_pipeline(trained)
-    # The pipeline scales in float32, as the features are.
-    np.testing.assert_allclose(
-        pipeline.decision_function(patches), trained.decision_function(patches), rtol=1e-4, atol=1e-4
-    )
-    np.testing.assert_array_equal(pipeline.predict(patches), trained.predict(patches))
-
-
-def test_from_pipeline_and_back(trained, patches):
-    again = VehicleClassifier.from_pipeline(to_pipeline(trained), SMALL, metadata=trained.metadata)
-    np.testing.assert_array_equal(again.decision_function(patches), trained.decision_function(patches))
-    assert again.params == trained.params
-    assert again.metadata == trained.metadata
+def test_templates_are_read_only_and_fit_the_params():
+    mean = np.zeros(4)
+    template = Template(mean, np.ones(4), np.ones(4), 0.0)
+    mean[0] = 5
+    assert template.mean[0] == 0
+    with pytest.raises(ValueError, match="read-only"):
+        template.coef[0] = 2
+    for templates, message in (
+        ((), "templates must hold at least one template; got none"),
+        (("abc",), "templates must be a Template, got 'abc'; load_classifier"),
+        ((template,), rf"templates must have {SMALL.length} weights, .* got 4"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            VehicleClassifier(SMALL, templates)
 
 
 @pytest.mark.parametrize("templates", [1, 3])
-@pytest.mark.parametrize("params", [SMALL, FeatureParams.preset("luv-2384")], ids=["small", "luv"])
+@pytest.mark.parametrize("params", [SMALL, FeatureParams.preset("lab-9432")], ids=["small", "lab"])
 def test_saving_and_loading_keeps_every_bit(tmp_path, params, templates):
     path = tmp_path / "model.safetensors"
     model = VehicleClassifier(
@@ -416,41 +354,28 @@ def test_saving_and_loading_keeps_every_bit(tmp_path, params, templates):
     assert path.read_bytes() == first
 
 
-def test_metadata_that_is_not_json(tmp_path):
+def test_models_that_cannot_be_saved(tmp_path, trained):
     model = VehicleClassifier(SMALL, random_classifier(SMALL).templates, {"when": object()})
     with pytest.raises(InvalidInputError, match="metadata must contain JSON values only"):
         model.save(tmp_path / "model.safetensors")
-    assert not list(tmp_path.iterdir())
-
-
-def test_saving_needs_a_folder(tmp_path, trained):
     with pytest.raises(InvalidInputError, match="path needs an existing folder"):
         trained.save(tmp_path / "nowhere" / "model.safetensors")
     with pytest.raises(InvalidInputError, match="path must be a file, got the folder"):
         trained.save(tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def write_model(path, tensors=None, **changes):
     """Write a model file as `save` does, but with whatever tensors and header; the checksum fits."""
-    from safetensors.numpy import save
-
     model = random_classifier(SMALL)
-    template = model.templates[0]
-    whole = {
-        "0.mean": template.mean,
-        "0.scale": template.scale,
-        "0.coef": template.coef,
-        "0.intercept": np.zeros(1),
-        **(tensors or {}),
-    }
+    whole = {f"0.{name}": getattr(model.templates[0], name) for name in ("mean", "scale", "coef")}
+    whole |= {"0.intercept": np.zeros(1), **(tensors or {})}
     whole = {name: np.array(tensor) for name, tensor in whole.items() if tensor is not None}
     header = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "kind": KIND,
-        "params": json.dumps(
-            {"spatial_size": 8, "hist_bins": 8, "orient": 4, "pix_per_cell": 16, "hog_channel": 0}
-        ),
+        "params": json.dumps(dataclasses.asdict(SMALL)),
         "metadata": "{}",
         **changes,
     }
@@ -460,27 +385,18 @@ def write_model(path, tensors=None, **changes):
     return path
 
 
-def test_the_model_file_of_these_tests_is_valid(tmp_path):
-    assert load_classifier(write_model(tmp_path / "m.safetensors")).params == SMALL
-
-
 @pytest.mark.parametrize(
     ("tensors", "message"),
     [
         ({"0.coef": np.full(SMALL.length, np.nan)}, "coef must be finite"),
-        ({"0.mean": np.full(SMALL.length, np.inf)}, "mean must be finite"),
         ({"0.scale": np.zeros(SMALL.length)}, "scale must be positive"),
-        ({"0.intercept": np.array([np.nan])}, "intercept must be finite"),
         ({"0.coef": np.ones(5)}, "coef must be a vector of the features' length"),
-        ({"0.coef": np.ones((2, SMALL.length))}, "coef must be a vector"),
         ({"0.intercept": np.zeros(2)}, "cannot reshape"),
         (
             {"0.mean": np.zeros(5), "0.scale": np.ones(5), "0.coef": np.ones(5)},
             f"templates must have {SMALL.length} weights, the length of the features; got 5",
         ),
         ({"0.mean": None}, "'0.mean'"),
-        ({"0.intercept": None}, "'0.intercept'"),
-        ({"1.mean": np.zeros(SMALL.length)}, "'1.scale'"),
         ({"extra": np.zeros(3)}, "'1.mean'"),
         (dict.fromkeys(("0.mean", "0.scale", "0.coef", "0.intercept")), "at least one template"),
     ],
@@ -495,20 +411,14 @@ def test_invalid_tensors(tmp_path, tensors, message):
     ("changes", "message"),
     [
         ({"format": "other"}, "is a safetensors file, but not a model of this library"),
-        ({"format": None}, "is a safetensors file, but not a model of this library"),
         ({"format_version": "99"}, f"has format version 99, this release reads {FORMAT_VERSION}; train"),
-        ({"format_version": None}, "has format version None"),
         ({"sha256": "0" * 64}, r"was changed after it was written \(checksum differs\)"),
         ({"params": '{"orient": 0}'}, "does not fit its own parameters: orient must be an integer"),
         ({"params": '{"color": 1}'}, "does not fit its own parameters"),
-        ({"params": "[]"}, "does not fit its own parameters"),
         ({"params": "{"}, r"has no readable parameters \(.*\); download it again"),
-        ({"params": "5"}, r"has no readable parameters"),
         ({"params": None}, r"has no readable parameters \('params'\)"),
         ({"metadata": None}, r"has no readable parameters \('metadata'\)"),
-        ({"metadata": "nonsense"}, "has no readable parameters"),
         ({"kind": "other"}, "contains a model of kind 'other', not 'patches'; train one"),
-        ({"kind": None}, "contains a model of kind None, not 'patches'"),
         ({"params": '{"spatial_size": 16}'}, "does not fit its own parameters: templates must have 6156"),
     ],
 )
@@ -518,68 +428,33 @@ def test_invalid_headers(tmp_path, changes, message):
         load_classifier(path)
 
 
-def test_a_safetensors_file_without_metadata(tmp_path):
-    from safetensors.numpy import save
-
-    (tmp_path / "m.safetensors").write_bytes(save({"a": np.zeros(3)}))
-    with pytest.raises(ModelFileError, match="is not a complete safetensors file"):
-        load_classifier(tmp_path / "m.safetensors")
-
-
-def test_a_tensor_of_a_type_that_numpy_lacks(tmp_path):
-    header = json.dumps(
-        {"__metadata__": {"format": FORMAT}, "a": {"dtype": "BF16", "shape": [1], "data_offsets": [0, 2]}}
-    ).encode()
-    (tmp_path / "m.safetensors").write_bytes(struct.pack("<Q", len(header)) + header + bytes(2))
-    with pytest.raises(ModelFileError, match=r"model file .*(not a complete safetensors file|changed after)"):
-        load_classifier(tmp_path / "m.safetensors")
+def damaged_files(data):
+    """Yield the contents of damaged model files: cut, continued, changed, or of another kind."""
+    header = struct.unpack("<Q", data[:8])[0]
+    spaces = re.search(rb" *$", data[: 8 + header]).start()  # the header is filled up with spaces
+    yield from (data[:size] for size in (0, 4, 8, 100, len(data) // 2, len(data) - 1))
+    yield from (data + b"x", b"PK\x03\x04 zip", b"\xff" * 100, bytes(64), save({"a": np.zeros(3)}))
+    for place in (*range(0, spaces, 7), 8 + header, (8 + header + len(data)) // 2, len(data) - 1):
+        changed = bytearray(data)
+        changed[place] ^= 1
+        yield bytes(changed)
+    kind = {"dtype": "BF16", "shape": [1], "data_offsets": [0, 2]}  # which NumPy lacks
+    text = json.dumps({"__metadata__": {"format": FORMAT}, "a": kind}).encode()
+    yield struct.pack("<Q", len(text)) + text + bytes(2)
 
 
-def test_a_cut_model_file(tmp_path):
+def test_damaged_files_are_rejected(tmp_path):
     path = write_model(tmp_path / "m.safetensors")
-    data = path.read_bytes()
-    for size in (0, 4, 8, 100, len(data) // 2, len(data) - 1):
-        path.write_bytes(data[:size])
-        with pytest.raises(
-            ModelFileError, match=r"is not a complete safetensors file .* download it again or train"
-        ):
+    assert load_classifier(path).params == SMALL
+    messages = []
+    for content in damaged_files(path.read_bytes()):
+        path.write_bytes(content)
+        with pytest.raises(ModelFileError, match=r"model file .*m\.safetensors") as error:
             load_classifier(path)
-    path.write_bytes(data + b"x")
-    with pytest.raises(ModelFileError, match="is not a complete safetensors file"):
-        load_classifier(path)
-
-
-def test_a_flipped_byte_in_a_tensor(tmp_path):
-    path = write_model(tmp_path / "m.safetensors")
-    data = bytearray(path.read_bytes())
-    start = 8 + struct.unpack("<Q", data[:8])[0]
-    for place in (start, (start + len(data)) // 2, len(data) - 1):
-        damaged = data.copy()
-        damaged[place] ^= 1
-        path.write_bytes(damaged)
-        with pytest.raises(ModelFileError, match="was changed after it was written"):
-            load_classifier(path)
-
-
-def test_a_flipped_byte_in_the_header(tmp_path):
-    path = write_model(tmp_path / "m.safetensors")
-    data = path.read_bytes()
-    start = 8 + struct.unpack("<Q", data[:8])[0]
-    spaces = re.search(rb" *$", data[:start]).start()  # the header is filled up with spaces
-    for place in range(0, spaces, 7):
-        damaged = bytearray(data)
-        damaged[place] ^= 1
-        path.write_bytes(damaged)
-        with pytest.raises(ModelFileError, match=r"model file .*m\.safetensors"):
-            load_classifier(path)
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 zip", b"\xff" * 100, bytes(64)])
-def test_another_kind_of_file(tmp_path, content):
-    path = tmp_path / "svc.bin"
-    path.write_bytes(content)
-    with pytest.raises(ModelFileError, match=r"svc.bin is not a complete safetensors file"):
-        load_classifier(path)
+        messages.append(str(error.value))
+    for message in messages[:11]:
+        assert re.search("is not a complete safetensors file .* download it again or train", message), message
+    assert all("was changed after it was written" in message for message in messages[-4:-1])
 
 
 @pytest.mark.parametrize(("name", "content"), [("svc.p", b""), ("svc", b"\x80\x04\x95"), ("a.JOBLIB", b"x")])

@@ -8,7 +8,7 @@ from tests.helpers import random_classifier
 from vehicle_detection import course
 from vehicle_detection.course.reference import score_windows
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import FeatureParams, extract_features, single_img_features
+from vehicle_detection.features import FeatureParams, single_img_features
 from vehicle_detection.search import PixelBand, SearchParams
 from vehicle_detection.training import to_pipeline
 from vehicle_detection.windows import band_windows, search_windows, slide_window
@@ -68,12 +68,6 @@ def test_the_arguments_are_not_modified():
     np.testing.assert_array_equal(IMAGE, before)
 
 
-def test_the_exact_fit():
-    assert slide_window(image_of(64, 64)).tolist() == [[0, 0, 64, 64]]
-    assert slide_window(image_of(64, 63)).shape == (0, 4)
-    assert slide_window(image_of(63, 64)).shape == (0, 4)
-
-
 def test_steps_do_not_lose_a_pixel_to_rounding():
     # 110 * (1 - 0.7) is 33.000000000000004, 64 * (1 - 0.9) is 6.399999999999999, 50 * (1 - 0.9) is 4.99...
     for side, overlap, step in [(110, 0.7, 33), (64, 0.9, 6), (50, 0.9, 5), (8, 0.99, 1), (64, 0.875, 8)]:
@@ -87,15 +81,11 @@ def test_steps_do_not_lose_a_pixel_to_rounding():
     ("arguments", "message"),
     [
         ({"x_start_stop": (-5, 100)}, r"x_start_stop must satisfy 0 <= start < stop <= 200; got \(-5, 100\)"),
-        ({"x_start_stop": (0, 201)}, r"x_start_stop must satisfy 0 <= start < stop <= 200"),
         ({"y_start_stop": (60, 60)}, r"y_start_stop must satisfy 0 <= start < stop <= 120"),
         ({"y_start_stop": (400, None)}, r"y_start_stop must satisfy .*got \(400, 120\)"),
         ({"x_start_stop": (0, 1, 2)}, r"x_start_stop must be \(start, stop\), whole pixels or None"),
-        ({"x_start_stop": None}, r"x_start_stop must be \(start, stop\), whole pixels or None; got None"),
         ({"x_start_stop": (0.5, 100)}, r"x_start_stop must be \(start, stop\), whole pixels or None"),
-        ({"x_start_stop": ("0", 100)}, r"x_start_stop must be \(start, stop\), whole pixels or None"),
         ({"xy_window": 64}, "xy_window and xy_overlap must be pairs; got 64 and"),
-        ({"xy_window": (64, 64, 64)}, "xy_window and xy_overlap must be pairs"),
         ({"xy_overlap": 0.5}, "xy_window and xy_overlap must be pairs"),
         ({"xy_window": (64.0, 64)}, r"xy_window\[0\] must be an integer at least 1"),
         ({"xy_window": (64, 0)}, r"xy_window\[1\] must be an integer at least 1"),
@@ -156,11 +146,8 @@ def test_windows_above_the_minimum_score_are_returned():
     np.testing.assert_array_equal(some.boxes, windows[every.scores > min_score])
     default = search_windows(IMAGE, windows, CLASSIFIER)
     np.testing.assert_array_equal(default.boxes, windows[every.scores > 0])
-
-
-def test_no_windows():
-    found = search_windows(IMAGE, np.empty((0, 4)), CLASSIFIER, min_score=None)
-    assert found.boxes.shape == (0, 4)
+    none = search_windows(IMAGE, slide_window(image_of(64, 63)), CLASSIFIER, min_score=None)
+    assert none.boxes.shape == (0, 4)
 
 
 def test_threads_and_order_do_not_change_scores():
@@ -170,11 +157,6 @@ def test_threads_and_order_do_not_change_scores():
     np.testing.assert_array_equal(one.scores, two.scores)
     backwards = search_windows(IMAGE, windows[::-1], CLASSIFIER, min_score=None)
     np.testing.assert_allclose(backwards.scores[::-1], one.scores, rtol=1e-9, atol=1e-9)
-
-
-def test_windows_may_be_integers_in_a_float_array():
-    whole = search_windows(IMAGE, [[0.0, 0.0, 64.0, 64.0]], CLASSIFIER, min_score=None)
-    assert whole.boxes.tolist() == [[0, 0, 64, 64]]
 
 
 def test_both_borders_differ_only_in_the_gradients():
@@ -194,14 +176,6 @@ def test_both_borders_differ_only_in_the_gradients():
     own = search_windows(wide, window, classifier, min_score=None)
     shared = score_windows(wide, window, classifier)
     assert np.abs(own.scores - shared).max() > 1e-4
-
-
-def test_without_hog_both_borders_give_the_same_scores():
-    classifier = random_classifier(FeatureParams(hog_feat=False))
-    windows = slide_window(IMAGE, xy_overlap=(0.875, 0.875))
-    own = search_windows(IMAGE, windows, classifier, min_score=None)
-    shared = score_windows(IMAGE, windows, classifier)
-    np.testing.assert_allclose(shared, own.scores, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -239,15 +213,8 @@ def test_search_windows_rejects_other_invalid_arguments():
 
 def test_search_windows_does_not_modify_its_arguments():
     windows = slide_window(IMAGE)
-    image, boxes = IMAGE.copy(), windows.copy()
+    image, boxes = IMAGE.copy(), windows.astype(float)
     search_windows(image, boxes, CLASSIFIER)
     score_windows(image, boxes, CLASSIFIER)
     np.testing.assert_array_equal(image, IMAGE)
     np.testing.assert_array_equal(boxes, windows)
-
-
-def test_windows_have_the_features_of_patches():
-    image = image_of(64, 128, 9)
-    found = search_windows(image, [[64, 0, 128, 64]], CLASSIFIER, min_score=None)
-    features = extract_features([image[:, 64:]], SMALL)
-    np.testing.assert_array_equal(found.scores, CLASSIFIER.decision_function(features))

@@ -35,7 +35,6 @@ from vehicle_detection._common import (
     progress_bar,
     resolve_jobs,
 )
-from vehicle_detection._kernels import bin_of_value, degree_bounds, orientation_cotangents, sqrt_gradients
 from vehicle_detection._kernels import features as kernels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image
@@ -46,6 +45,7 @@ PATCH_SIZE = 64
 COLOR_SPACES = ("RGB", "HSV", "LUV", "HLS", "YUV", "YCrCb", "LAB")
 SPATIAL_ORDERS = ("channels", "interleaved")
 HOG_CHANNELS: tuple[int | str, ...] = (0, 1, 2, "ALL", "GRAY")
+_LUV = {"color_space": "LUV", "hist_bins": 16, "orient": 8, "hog_channel": 0, "transform_sqrt": True}
 _LAB = {"color_space": "LAB", "spatial_size": 32}
 
 
@@ -62,32 +62,29 @@ class FeatureParams(Checked):
 
     Attributes
     ----------
-    color_space
-        Color space: ``"RGB"``, ``"HSV"``, ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or ``"LAB"``.
-    spatial_color_space, hist_color_space
-        Color space of the spatial bins and of the histogram; None means `color_space`.
+    color_space, spatial_color_space, hist_color_space
+        ``"RGB"``, ``"HSV"``, ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or ``"LAB"``; that of the spatial
+        bins and of the histogram, None for `color_space`.
     spatial_feat, hist_feat, hog_feat
         Which of the three parts to compute.
     spatial_size
-        Side length of the grid of spatial bins, which gives ``spatial_size**2 * 3`` values; a pair of equal
-        numbers is accepted too.
+        Side length of the grid of spatial bins, which gives ``spatial_size**2 * 3`` values; also a pair.
     spatial_order
         ``"channels"``: the spatial bins of one channel after the other; ``"interleaved"``: pixel by pixel,
-        as ``cv2.resize(image, size).ravel()`` orders them. A model that was trained on the other order loads
-        without an error, but its scores are wrong.
+        as ``cv2.resize(image, size).ravel()`` orders them. With the other order than that of the training,
+        a model's scores are wrong.
     hist_bins, hist_sqrt
-        Number of bins of each channel's histogram over 0-255, and whether to use the square roots of the
-        counts, so that a full bin dominates less.
+        Number of bins of each channel's histogram over 0-255; take the square roots of the counts, so that a
+        full bin dominates less.
     orient, pix_per_cell, cell_per_block
-        Number of HOG orientations over 0-180 degrees, and side lengths of a HOG cell in pixels and of a block
-        in cells.
+        Number of HOG orientations over 0-180 degrees; sides of a cell in pixels and of a block in cells.
     hog_channel
         Channel of HOG: 0, 1, 2, ``"ALL"``, or ``"GRAY"`` for the gray image in any `color_space`.
     transform_sqrt, coarse_hog
         Compute HOG on the square root of the pixel values; append the HOG of cells of twice the size.
     hist_gain, coarse_gain
-        Factors of the scaled histogram and the scaled coarse HOG in training. A larger factor weakens the
-        regularization of these few features. The gains change the weights only, not the features.
+        Factors of the scaled histogram and the scaled coarse HOG in training: a larger one weakens the
+        regularization of these few features. They change the weights only, not the features.
 
     Examples
     --------
@@ -117,13 +114,7 @@ class FeatureParams(Checked):
     coarse_gain: float = number(1.0, low=0.01, high=100)
 
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = {
-        "luv-2384": {
-            "color_space": "LUV",
-            "hist_bins": 16,
-            "orient": 8,
-            "hog_channel": 0,
-            "transform_sqrt": True,
-        },
+        "luv-2384": _LUV,
         "ycrcb-6156": {},
         "ycrcb-8460": {"spatial_size": 32},
         "lab-8460": _LAB,
@@ -170,7 +161,7 @@ class FeatureParams(Checked):
 
     @property
     def used_color_spaces(self) -> set[str]:
-        """Color spaces that an image is converted to; not the gray image of ``hog_channel="GRAY"``."""
+        """Color spaces that an image is converted to, apart from the gray image of HOG."""
         parts = (
             (self.spatial_space, self.spatial_feat),
             (self.hist_space, self.hist_feat),
@@ -219,8 +210,7 @@ class FeatureParams(Checked):
         return self._block_values(self.coarse_blocks)
 
     def _block_values(self, blocks: int) -> int:
-        values = blocks**2 * self.cell_per_block**2 * self.orient * self.hog_channels
-        return values if self.hog_feat else 0
+        return (blocks * self.cell_per_block) ** 2 * self.orient * self.hog_channels * self.hog_feat
 
     @property
     def length(self) -> int:
@@ -245,13 +235,11 @@ def convert_color(
 
     Parameters
     ----------
-    image
-        ``(H, W, 3)`` uint8 RGB.
+    image, out
+        ``(H, W, 3)`` uint8 RGB; output array of this shape, None allocates one.
     color_space
         ``"RGB"``, ``"HSV"`` (hue 0-179), ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or ``"LAB"``; the
         course's spelling ``"RGB2YCrCb"`` is also accepted.
-    out
-        Output array of the image's shape; None allocates one.
 
     Examples
     --------
@@ -289,13 +277,29 @@ def hog_source(
     return np.ascontiguousarray(converted[..., int(params.hog_channel), None])
 
 
+def hog_cells(
+    image: NDArray[Any], orient: int, cell: int, transform_sqrt: bool, cells: NDArray[np.float32]
+) -> None:
+    """Fill ``(channels, orient, rows, columns)`` float32 with the orientation histograms of an image's cells.
+
+    Equals the first stage of scikit-image's HOG; `image` is ``(H, W, channels)``, uint8 or float.
+    """
+    channels = image.shape[2]
+    if transform_sqrt:
+        if image.dtype != np.uint8 and image.min() < 0:
+            raise InvalidInputError(
+                "transform_sqrt must be False for negative values, which float LUV and LAB images have; "
+                "convert a uint8 image, or switch it off"
+            )
+        gradients = kernels.sqrt_gradients(image)
+        kernels.sum_orientations(*gradients, kernels.degree_bounds(orient), channels, cell, cells)
+    else:
+        flat = np.ascontiguousarray(image).reshape(len(image), -1)
+        kernels.hog_cells(flat, channels, cell, kernels.orientation_cotangents(orient), cells)
+
+
 def hog_blocks(
-    img: NDArray[np.uint8],
-    orient: int = 9,
-    pix_per_cell: int = 8,
-    cell_per_block: int = 2,
-    *,
-    transform_sqrt: bool = False,
+    img: NDArray[np.uint8], orient: int, pix_per_cell: int, cell_per_block: int, transform_sqrt: bool = False
 ) -> NDArray[np.float64]:
     """HOG of one channel: ``(block rows, block columns, cell rows, cell columns, orient)`` float64."""
     from skimage.feature import hog
@@ -337,32 +341,23 @@ def get_hog_features(
     ----------
     img
         ``(H, W)`` uint8, one channel.
-    orient
-        Number of orientations over 0-180 degrees.
-    pix_per_cell, cell_per_block
-        Side lengths of a cell in pixels and of a block in cells.
-    transform_sqrt
-        Use the square root of the pixel values.
+    orient, pix_per_cell, cell_per_block, transform_sqrt
+        As in `FeatureParams`.
 
     Examples
     --------
     >>> get_hog_features(np.zeros((64, 64), np.uint8)).shape
     (1764,)
     """
-    return hog_blocks(img, orient, pix_per_cell, cell_per_block, transform_sqrt=transform_sqrt).ravel()
+    return hog_blocks(img, orient, pix_per_cell, cell_per_block, transform_sqrt).ravel()
 
 
 def hog_image(
     img: NDArray[np.uint8], orient: int = 9, pix_per_cell: int = 8, *, transform_sqrt: bool = False
 ) -> NDArray[np.float64]:
-    """Visualize the orientation histogram of each cell as a star of lines.
+    """Visualize the orientation histogram of each cell as a star of lines: ``(H, W)`` float64.
 
-    Returns ``(H, W)`` float64, for ``plt.imshow``.
-
-    Parameters
-    ----------
-    img, orient, pix_per_cell, transform_sqrt
-        As in `get_hog_features`.
+    The parameters are those of `get_hog_features`.
     """
     from skimage.feature import hog
 
@@ -379,16 +374,12 @@ def bin_spatial(
     *,
     order: Literal["channels", "interleaved"] = "channels",
 ) -> NDArray[np.uint8]:
-    """Pixel values of a downscaled image.
-
-    Returns ``(width * height * 3,)`` uint8.
+    """Pixel values of a downscaled image: ``(width * height * 3,)`` uint8.
 
     Parameters
     ----------
-    img
-        ``(H, W, 3)`` uint8 in any color space.
-    size
-        Width and height to scale to, or an integer for both.
+    img, size
+        ``(H, W, 3)`` uint8 in any color space, and width and height to scale to, or an integer for both.
     order
         ``"channels"``: one channel after the other; ``"interleaved"``: pixel by pixel.
 
@@ -408,16 +399,12 @@ def bin_spatial(
 
 
 def color_hist(img: NDArray[np.uint8], nbins: int = 32) -> NDArray[np.int64]:
-    """Concatenated histograms of the channels over 0-255.
-
-    Returns ``(3 * nbins,)`` int64 counts.
+    """Concatenated histograms of the channels over 0-255: ``(3 * nbins,)`` int64 counts.
 
     Parameters
     ----------
-    img
-        ``(H, W, 3)`` uint8 in any color space.
-    nbins
-        Number of bins of each channel.
+    img, nbins
+        ``(H, W, 3)`` uint8 in any color space, and the number of bins of each channel.
 
     Examples
     --------
@@ -433,15 +420,12 @@ def color_hist(img: NDArray[np.uint8], nbins: int = 32) -> NDArray[np.int64]:
 def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None = None) -> NDArray[np.float64]:
     """Feature vector of one 64x64 patch, computed by the reference functions.
 
-    Returns ``(params.length,)`` float64, ``[spatial | histogram | HOG | coarse HOG]``, each channel by
-    channel.
+    Returns ``(params.length,)`` float64.
 
     Parameters
     ----------
-    image
-        ``(64, 64, 3)`` uint8 RGB.
-    params
-        Features to compute; the default is ``FeatureParams()``.
+    image, params
+        ``(64, 64, 3)`` uint8 RGB, and the features to compute, by default ``FeatureParams()``.
 
     Examples
     --------
@@ -450,13 +434,8 @@ def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None =
     """
     params = _check_params(params)
     check_patches([image], PATCH_SIZE, "image")
-    parts: list[NDArray[Any]] = []
-    if params.spatial_feat:
-        converted = convert_color(image, params.spatial_space)
-        parts.append(bin_spatial(converted, params.spatial_size, order=params.spatial_order))
-    if params.hist_feat:
-        counts = color_hist(convert_color(image, params.hist_space), params.hist_bins)
-        parts.append(np.sqrt(counts) if params.hist_sqrt else counts)
+    spatial, hist = (convert_color(image, space) for space in (params.spatial_space, params.hist_space))
+    parts = color_parts(spatial, hist, params)
     if params.hog_feat:
         source = hog_source(image, params)
         orient, block, root = params.orient, params.cell_per_block, params.transform_sqrt
@@ -466,6 +445,19 @@ def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None =
             for channel in np.moveaxis(source, -1, 0)
         ]
     return np.concatenate(parts).astype(np.float64)
+
+
+def color_parts(
+    spatial: NDArray[np.uint8], hist: NDArray[np.uint8], params: FeatureParams
+) -> list[NDArray[Any]]:
+    """Spatial bins and histogram of a patch in their color spaces, where they are used."""
+    parts: list[NDArray[Any]] = []
+    if params.spatial_feat:
+        parts.append(bin_spatial(spatial, params.spatial_size, order=params.spatial_order))
+    if params.hist_feat:
+        counts = color_hist(hist, params.hist_bins)
+        parts.append(np.sqrt(counts) if params.hist_sqrt else counts)
+    return parts
 
 
 def extract_features(
@@ -482,14 +474,12 @@ def extract_features(
     Parameters
     ----------
     source
-        ``(N, 64, 64, 3)`` uint8 RGB, a `PatchSet`, or a list of patches or a list or array of paths of image
-        files.
+        ``(N, 64, 64, 3)`` uint8 RGB, a `PatchSet`, or a list of patches or of paths of image files.
     params
         Features to compute; the default is ``FeatureParams()``.
-    jobs
-        Number of threads, without effect on the result; None uses ``VEHICLE_DETECTION_JOBS`` or all cores.
-    progress
-        Show a progress bar on standard error.
+    jobs, progress
+        Number of threads, without effect on the result (None: ``VEHICLE_DETECTION_JOBS`` or all cores); show
+        a progress bar on standard error.
 
     Examples
     --------
@@ -525,9 +515,8 @@ def _extract_batch(patches: NDArray[np.uint8], features: NDArray[np.float32], pa
         for row, patch in zip(spatial, converted[params.spatial_space].reshape(patches.shape)):
             params.spatial_planes(row)[:] = cv2.resize(patch, size).transpose(2, 0, 1)
     if params.hist_feat:
-        bins = params.hist_bins
-        colors = converted[params.hist_space].reshape(patches.shape)
-        kernels.patch_histograms(colors, bin_of_value(bins), bins, hist)
+        colors, bins = converted[params.hist_space].reshape(patches.shape), params.hist_bins
+        kernels.patch_histograms(colors, kernels.bin_of_value(bins), bins, hist)
         if params.hist_sqrt:
             np.sqrt(hist, out=hist)
     if params.hog_feat:
@@ -536,11 +525,11 @@ def _extract_batch(patches: NDArray[np.uint8], features: NDArray[np.float32], pa
         source = hog_source(tall, params, converted.get(params.color_space))
         source = source.reshape(len(patches), PATCH_SIZE, PATCH_SIZE, channels)
         if params.transform_sqrt:
-            bounds = degree_bounds(params.orient)
-            kernels.patch_hog_from_angles(*sqrt_gradients(source), bounds, channels, *sizes, hog)
+            bounds = kernels.degree_bounds(params.orient)
+            kernels.patch_hog_from_angles(*kernels.sqrt_gradients(source), bounds, channels, *sizes, hog)
         else:
             flat = source.reshape(len(patches), PATCH_SIZE, PATCH_SIZE * channels)
-            kernels.patch_hog(flat, channels, *sizes, orientation_cotangents(params.orient), hog)
+            kernels.patch_hog(flat, channels, *sizes, kernels.orientation_cotangents(params.orient), hog)
 
 
 def read_patches(source: Any, name: str) -> NDArray[np.uint8]:
@@ -582,7 +571,6 @@ def sum_blocks(blocks: NDArray[Any]) -> NDArray[np.float64]:
     """
     down, across, side, _, orient = blocks.shape
     sums = np.zeros((down + side - 1, across + side - 1, orient))
-    for row in range(side):
-        for column in range(side):
-            sums[row : row + down, column : column + across] += blocks[:, :, row, column]
+    for row, column in np.ndindex(side, side):
+        sums[row : row + down, column : column + across] += blocks[:, :, row, column]
     return sums

@@ -50,6 +50,7 @@ _BAND_HEAT = {
     ("score", False): HeatRange(12.0, 4.0, 40.0),
     ("count", False): HeatRange(16.0, 10.0, 56.0),
 }
+_START_WITH_ZEROS = "start with numpy.zeros(image.shape[:2], numpy.float32)"
 # Factor of the default thresholds of whole regions if all windows are of similar size.
 _SIMILAR_SIZES_FACTOR = 0.6
 
@@ -110,51 +111,29 @@ def heat_range(search: Any, params: HeatParams) -> HeatRange:
     return HeatRange(default, low, high)
 
 
-def _check_heat(heatmap: object) -> NDArray[Any]:
-    if (
-        not isinstance(heatmap, np.ndarray)
-        or heatmap.ndim != 2
-        or not heatmap.size
-        or heatmap.dtype.kind not in "iuf"
-    ):
+def _check_heat(heatmap: object, *, in_place: bool = False) -> NDArray[Any]:
+    array = heatmap if isinstance(heatmap, np.ndarray) else np.array(None)
+    if array.ndim != 2 or not array.size or array.dtype.kind not in "iuf":
         raise InvalidInputError(
-            f"heatmap must be an (H, W) number array, got {describe(heatmap)}; start with "
-            "numpy.zeros(image.shape[:2], numpy.float32)"
+            f"heatmap must be an (H, W) number array, got {describe(heatmap)}; {_START_WITH_ZEROS}"
         )
-    return heatmap
-
-
-def _check_writable_heat(heatmap: object) -> NDArray[Any]:
-    heat = _check_heat(heatmap)
-    if not heat.flags.writeable:
+    if in_place and not array.flags.writeable:
         raise InvalidInputError(
             "heatmap must be writable, because it is changed in place; got a read-only array, pass a copy"
         )
-    return heat
+    return array
 
 
 def add_heat(heatmap: Heat, boxes: Detections | ArrayLike, *, scores: ArrayLike | None = None) -> Heat:
-    """Add each window's heat to the pixels that it covers, in place.
-
-    A window is added as four corner differences, and one cumulative sum follows, so the cost does not depend
-    on the area of the windows.
-
-    Returns the same array, `heatmap`.
+    """Add each window's heat to the pixels that it covers, in place, and return the same array.
 
     Parameters
     ----------
     heatmap
-        ``(H, W)`` map of any number type; changed. Pass ``heatmap.copy()`` to keep it.
-    boxes
-        ``(N, 4)`` windows, which are rounded to whole pixels and clipped to the map.
-    scores
-        ``(N,)`` heat that each window adds; by default 1 each, as in the course.
-
-    Raises
-    ------
-    InvalidInputError
-        If the map is not two-dimensional, is read-only, or is of an integer type that cannot hold the new
-        heat; or if boxes and scores differ in number. The map is unchanged then.
+        ``(H, W)`` map of a number type that holds the new heat; changed, but not in case of an error.
+    boxes, scores
+        ``(N, 4)`` windows, which are rounded to whole pixels and clipped to the map, and ``(N,)`` heat that
+        each adds; by default 1, as in the course.
 
     Examples
     --------
@@ -165,15 +144,15 @@ def add_heat(heatmap: Heat, boxes: Detections | ArrayLike, *, scores: ArrayLike 
     array([[1., 2., 1., 0.],
            [1., 1., 0., 0.]])
     """
-    heat = _check_writable_heat(heatmap)
+    heat = _check_heat(heatmap, in_place=True)
     windows = check_boxes(boxes)
-    weights = (
-        np.ones(len(windows)) if scores is None else Detections(windows, check_array(scores, "scores")).scores
-    )
+    given = np.ones(len(windows)) if scores is None else check_array(scores, "scores")
+    weights = Detections(windows, given).scores
     windows = clip_boxes(np.rint(windows), heat.shape).astype(np.int64)
     if not len(windows):
         return heatmap
-    # Only the rectangle around all windows is summed.
+    # A window is four corner differences, and their cumulative sum follows, in the rectangle around all
+    # windows: the cost does not depend on the area of a window.
     (left, top), (right, bottom) = windows[:, :2].min(axis=0), windows[:, 2:].max(axis=0)
     x1, y1, x2, y2 = (windows - (left, top, left, top)).T
     corners = np.zeros((bottom - top + 1, right - left + 1))
@@ -196,20 +175,12 @@ def _check_holds(values: NDArray[np.float64], dtype: np.dtype[Any]) -> None:
     if (values != np.rint(values)).any() or values.min() < limits.min or values.max() > limits.max:
         raise InvalidInputError(
             f"heatmap of dtype {dtype} holds whole numbers from {limits.min} to {limits.max} only; the new "
-            f"heat is {values.min():g} to {values.max():g}; start with "
-            "numpy.zeros(image.shape[:2], numpy.float32)"
+            f"heat is {values.min():g} to {values.max():g}; {_START_WITH_ZEROS}"
         )
 
 
 def apply_threshold(heatmap: Heat, threshold: float) -> Heat:
-    """Set heat at or below the threshold to zero, in place.
-
-    Returns the same array, `heatmap`.
-
-    Parameters
-    ----------
-    heatmap, threshold
-        ``(H, W)`` map, which is changed, and the highest heat that is removed.
+    """Set heat at or below the threshold to zero, in place, and return the same ``(H, W)`` array.
 
     Examples
     --------
@@ -217,15 +188,13 @@ def apply_threshold(heatmap: Heat, threshold: float) -> Heat:
     >>> apply_threshold(heat, 2) is heat, heat.tolist()
     (True, [[0.0, 0.0, 3.0]])
     """
-    heat = _check_writable_heat(heatmap)
+    heat = _check_heat(heatmap, in_place=True)
     heat[heat <= check_number(threshold, "threshold")] = 0
     return heatmap
 
 
 def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, peak_fraction: float = 0.0) -> Detections:
-    """Find the connected regions of a heat map and their bounding boxes.
-
-    Returns ``(N, 4)`` int64 boxes and the heat of their peaks, ordered from top to bottom.
+    """Find the boxes of a heat map's connected regions and the heat of their peaks, from top to bottom.
 
     Parameters
     ----------
@@ -268,9 +237,7 @@ def _connected_components(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], N
 
 
 def bounding_boxes(shape: tuple[int, ...], windows: Any, *, params: HeatParams | None = None) -> Detections:
-    """Find the boxes of a frame's positive windows: heat map, threshold and labels in one call.
-
-    Returns boxes and the heat of their peaks.
+    """Find the boxes of a frame's positive windows: heat map, threshold and labels, see `label_boxes`.
 
     Parameters
     ----------
@@ -279,11 +246,6 @@ def bounding_boxes(shape: tuple[int, ...], windows: Any, *, params: HeatParams |
         ``weighting="count"``.
     params
         By default ``HeatParams()``. Without a threshold in it, that for the windows of `find_cars`.
-
-    Raises
-    ------
-    InvalidInputError
-        If `shape` is not the shape of an image or the windows have no scores for ``weighting="score"``.
 
     Examples
     --------

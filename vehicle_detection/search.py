@@ -44,17 +44,11 @@ from vehicle_detection._common import (
     number,
     single_threaded_opencv,
 )
-from vehicle_detection._kernels import (
-    Filter,
-    bin_of_value,
-    degree_bounds,
-    orientation_cotangents,
-    sqrt_gradients,
-)
+from vehicle_detection._kernels import Filter
 from vehicle_detection._kernels import features as kernels
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import PATCH_SIZE, FeatureParams, convert_color, hog_source
+from vehicle_detection.features import PATCH_SIZE, FeatureParams, convert_color, hog_cells, hog_source
 
 REFERENCE_WIDTH = 1280
 """Search windows are given in pixels of a frame whose longer side has this length."""
@@ -104,13 +98,11 @@ class SearchBand(Checked):
 
     Attributes
     ----------
-    window
-        Width and height of the windows.
+    window, overlap
+        Width and height of the windows, and the overlap of neighbors as fractions of these, in [0, 1).
     y, x
         Top and bottom of the band relative to the horizon, positive downwards; left and right end as
         fractions of the frame's width, 0-1.
-    overlap
-        Horizontal and vertical overlap of neighboring windows as fractions of their size, in [0, 1).
     """
 
     window: tuple[float, float] = checked_field(MISSING, _pair(low=8, high=4096))
@@ -206,9 +198,7 @@ class SearchParams(Checked):
     def window_density(self) -> float:
         """Number of windows of similar size that cover a point, as the mean over the bands."""
         sides = [math.sqrt(band.window[0] * band.window[1]) for band in self.bands]
-        covers = [
-            math.prod(1 / max(1 - overlap, _MIN_STEP) for overlap in band.overlap) for band in self.bands
-        ]
+        covers = [math.prod(1 / max(1 - part, _MIN_STEP) for part in band.overlap) for band in self.bands]
         similar = [
             cover
             for side in sides
@@ -230,15 +220,13 @@ class SearchParams(Checked):
 
 
 def _window_list() -> SearchParams:
-    bands = tuple(
-        SearchBand(window=window, y=y, x=(650 / 1280, 1.0), overlap=overlap)
-        for window, y, overlap in (
-            ((96.0, 96.0), (-5.0, 130.0), (0.9, 0.5)),
-            ((110.0, 145.0), (-20.0, 190.0), (0.7, 0.6)),
-            ((155.0, 165.0), (-30.0, 190.0), (0.6, 0.5)),
-            ((170.0, 200.0), (0.0, 300.0), (0.6, 0.5)),
-        )
+    table = (
+        ((96.0, 96.0), (-5.0, 130.0), (0.9, 0.5)),
+        ((110.0, 145.0), (-20.0, 190.0), (0.7, 0.6)),
+        ((155.0, 165.0), (-30.0, 190.0), (0.6, 0.5)),
+        ((170.0, 200.0), (0.0, 300.0), (0.6, 0.5)),
     )
+    bands = tuple(SearchBand(window=w, y=y, x=(650 / 1280, 1.0), overlap=overlap) for w, y, overlap in table)
     return SearchParams(bands=bands, horizon=400 / 720)
 
 
@@ -270,10 +258,8 @@ class SearchResult:
     vehicles
         Vehicle boxes, if the model predicts them; None if they are derived from the windows. Scores below 0
         are kept for tracking only.
-    shape
-        ``(height, width)`` of the frame.
-    seconds
-        Duration of the search.
+    shape, seconds
+        ``(height, width)`` of the frame, and the duration of the search.
     """
 
     windows: Detections
@@ -304,15 +290,11 @@ class FrameSearch(Closing, ABC):
 
         Parameters
         ----------
-        frame
-            ``(H, W, 3)`` uint8 RGB.
-        params
-            `SearchParams`, `NetworkParams` or `FunctionParams`, depending on the model; the default suits any
-            dash-cam.
+        frame, params
+            ``(H, W, 3)`` uint8 RGB, and `SearchParams`, `NetworkParams` or `FunctionParams`, depending on the
+            model; the default suits any dash-cam.
         min_vehicle_score
-            Minimum score of a vehicle. It has no effect if vehicles are derived from the windows.
-
-        An error says what is malformed, or that a search with `SearchParams` has no window in the frame.
+            Minimum score of a vehicle, without effect if vehicles are derived from the windows.
         """
         start = time.perf_counter()
         height, width, _ = check_image(frame, "frame").shape
@@ -355,19 +337,19 @@ class BandSearch(FrameSearch):
         cell, min_score = self.filters.params.pix_per_cell, float(params.min_score)
         with single_threaded_opencv():
             parts = self._team.map(
-                lambda band: _hits(self.score_map(image, band), band, cell, min_score), bands, cost=_cost
+                lambda band: _hits(self.score_map(image, band), band, cell, min_score),
+                bands,
+                cost=lambda band: math.prod(resized_shape(band)),
             )
         boxes, scores = zip(*parts)
         return Detections(np.concatenate(boxes), np.concatenate(scores))
 
     def score_map(self, image: NDArray[np.uint8], band: PixelBand) -> NDArray[np.float32]:
-        """Score of every window of a band at a step of one cell, ``(rows, columns)`` float32.
+        """Score of every window of a band, ``(rows, columns)`` float32; the maximum of several templates.
 
-        Entry ``[i, j]`` is the window that starts at row `i` and column `j` of the resized band's cells. With
-        several templates, it is the maximum of their scores.
+        Entry ``[i, j]`` is the window that starts at row `i` and column `j` of the resized band's cells.
         """
-        workspace = self.workspace
-        return self.filters.score_map(resize_band(image, band, workspace), workspace)
+        return self.filters.score_map(resize_band(image, band, self.workspace), self.workspace)
 
 
 def resized_shape(band: PixelBand) -> tuple[int, int]:
@@ -396,11 +378,6 @@ def resize_band(
     memory = workspace.take((height, width, 3), np.uint8, "band")
     padded = cv2.copyMakeBorder(strip, 0, 0, left, right, cv2.BORDER_REPLICATE, dst=memory)
     return np.asarray(padded, np.uint8)
-
-
-def _cost(band: PixelBand) -> float:
-    height, width = resized_shape(band)
-    return float(height * width)
 
 
 def _hits(
@@ -435,9 +412,7 @@ class BandFilters:
         self.hist_roots = params.hist_feat and params.hist_sqrt
         self.hist_lookup = params.hist_feat and not params.hist_sqrt
         self.coarse = params.coarse_blocks if params.hog_feat else 0
-        self.cotangents = orientation_cotangents(params.orient)
-        self.bounds = degree_bounds(params.orient)
-        self.bins = bin_of_value(params.hist_bins)
+        self.bins = kernels.bin_of_value(params.hist_bins)
         self.biases = [bias for _, bias in functions]
         self.filters = [self._build_filters(weights) for weights, _ in functions]
         hist = slice(params.spatial_length, params.spatial_length + params.hist_length)
@@ -475,31 +450,23 @@ class BandFilters:
             space: convert_color(band, space, out=workspace.take(band.shape, np.uint8, space))
             for space in params.used_color_spaces
         }
-        return self.score_converted(band, converted, workspace)
-
-    def score_converted(
-        self, band: NDArray[np.uint8], converted: dict[str, NDArray[np.uint8]], workspace: Workspace
-    ) -> NDArray[np.float32]:
-        """Scores of all windows of a resized band, given its conversion to each color space."""
-        params = self.params
-        hog = self._hog_maps(band, converted, workspace) if params.hog_feat else []
+        source = hog_source(band, params, converted.get(params.color_space)) if params.hog_feat else None
         spatial, hist = (converted.get(space, band) for space in (params.spatial_space, params.hist_space))
-        return self.score_maps(hog, spatial, hist, self.tables, workspace)
+        return self.score_images(source, spatial, hist, self.tables, workspace)
 
-    def score_maps(
+    def score_images(
         self,
-        hog: list[NDArray[np.float32]],
+        source: NDArray[Any] | None,
         spatial: NDArray[Any],
         hist: NDArray[Any],
         tables: NDArray[np.float32] | None,
         workspace: Workspace,
     ) -> NDArray[np.float32]:
-        """Scores of all windows from the HOG of a band and the images of spatial bins and histogram.
+        """Scores of all windows from the images of HOG, spatial bins and histogram, ``(H, W, channels)``.
 
-        `hog` are ``(channels, rows, columns)`` for each filter over HOG. `tables` is
-        ``(templates, 3, values)``, the histogram's weight of each value of the integer image `hist`.
+        `tables` is ``(templates, 3, values)``, the histogram's weight of each value of the integers `hist`.
         """
-        cell, maps = self.params.pix_per_cell, list(hog)
+        cell, maps = self.params.pix_per_cell, self._hog_maps(source, workspace)
         rows, columns = spatial.shape[0] // cell, spatial.shape[1] // cell
         if self.params.spatial_feat or self.hist_lookup:
             maps.append(self._value_map(spatial, workspace))
@@ -516,20 +483,14 @@ class BandFilters:
             kernels.add_root_histograms(hist, self.bins, weights, cell, self.cells, scores)
         return scores[0] if len(scores) == 1 else np.asarray(scores.max(axis=0))
 
-    def _hog_maps(
-        self, band: NDArray[np.uint8], converted: dict[str, NDArray[np.uint8]], workspace: Workspace
-    ) -> list[NDArray[np.float32]]:
+    def _hog_maps(self, source: NDArray[Any] | None, workspace: Workspace) -> list[NDArray[np.float32]]:
         """Compute the blocks of HOG and, if used, of coarse HOG; each ``(channels, rows, columns)``."""
-        params, channels = self.params, self.params.hog_channels
-        cell = params.pix_per_cell
-        rows, columns = band.shape[0] // cell, band.shape[1] // cell
-        source = hog_source(band, params, converted.get(params.color_space))
+        if source is None:
+            return []
+        params, cell = self.params, self.params.pix_per_cell
+        rows, columns, channels = source.shape[0] // cell, source.shape[1] // cell, source.shape[2]
         cells = workspace.take((channels, params.orient, rows, columns), np.float32, "cells")
-        if params.transform_sqrt:
-            kernels.sum_orientations(*sqrt_gradients(source), self.bounds, channels, cell, cells)
-        else:
-            flat = np.ascontiguousarray(source).reshape(source.shape[0], -1)
-            kernels.hog_cells(flat, channels, cell, self.cotangents, cells)
+        hog_cells(source, params.orient, cell, params.transform_sqrt, cells)
         shape = (channels, self.block, self.block, params.orient, rows, columns)
         blocks = workspace.take(shape, np.float32, "blocks")
         kernels.normalize_blocks(cells, self.block, 1, blocks)
@@ -559,15 +520,11 @@ class BandFilters:
 
 def _check_shareable(params: FeatureParams) -> None:
     """Reject features that windows cannot share exactly."""
-    remedy = "use search_windows, or other parameters"
-    if params.cells * params.pix_per_cell != PATCH_SIZE:
-        raise InvalidInputError(
-            f"find_cars needs whole HOG cells in a window of {PATCH_SIZE} pixels, got "
-            f"pix_per_cell={params.pix_per_cell}; {remedy}"
-        )
-    size = params.spatial_size
-    if params.spatial_feat and (size % params.cells or PATCH_SIZE % size):
-        raise InvalidInputError(
-            f"find_cars needs whole spatial bins in a cell of {params.pix_per_cell} pixels, got "
-            f"spatial_size={size}; {remedy}"
-        )
+    cell, size = params.pix_per_cell, params.spatial_size
+    if PATCH_SIZE % cell:
+        problem = f"HOG cells in a window of {PATCH_SIZE} pixels, got pix_per_cell={cell}"
+    elif params.spatial_feat and (size % params.cells or PATCH_SIZE % size):
+        problem = f"spatial bins in a cell of {cell} pixels, got spatial_size={size}"
+    else:
+        return
+    raise InvalidInputError(f"find_cars needs whole {problem}; use search_windows, or other parameters")

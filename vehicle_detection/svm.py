@@ -126,20 +126,14 @@ class VehicleClassifier:
     def calibration(self) -> Platt:
         """Probability that a box contains a vehicle, by its best window's score, on the course's road.
 
-        Other roads have more lookalikes, and the probabilities there are too high; so may be those of models
-        with other features.
+        It is too high on other roads, which have more lookalikes, and for models with other features.
         """
         return _BOX_CALIBRATION
 
     def decision_function(self, X: ArrayLike) -> NDArray[np.float64]:
-        """Score of each patch: its signed distance from the separating hyperplane, positive for a vehicle.
+        """Score of each patch, positive for a vehicle: ``(N,)`` float64, the maximum of several templates.
 
-        Returns ``(N,)`` float64; with several templates, the maximum of their scores.
-
-        Parameters
-        ----------
-        X
-            ``(N, length)`` feature vectors, or ``(N, 64, 64, 3)`` uint8 RGB patches.
+        `X` is ``(N, length)`` feature vectors, or ``(N, 64, 64, 3)`` uint8 RGB patches.
         """
         features = self._features_of(X)
         folded = [template.fold() for template in self.templates]
@@ -155,17 +149,7 @@ class VehicleClassifier:
         return (self.decision_function(X) > 0).astype(np.int64)
 
     def score(self, X: ArrayLike, y: ArrayLike) -> float:
-        """Accuracy: fraction of correct predictions.
-
-        Returns a fraction in [0, 1].
-
-        Parameters
-        ----------
-        X
-            As in `decision_function`.
-        y
-            ``(N,)`` labels, 1 for a vehicle, 0 otherwise.
-        """
+        """Accuracy, 0 to 1, for ``(N,)`` labels `y`, 1 for a vehicle; `X` as in `decision_function`."""
         labels, predicted = check_array(y, "y"), self.predict(X)
         if labels.shape != predicted.shape or not labels.size:
             raise InvalidInputError(
@@ -207,19 +191,16 @@ class VehicleClassifier:
             ``LogisticRegression`` or ``SVC(kernel="linear")``, fitted on the labels 0 (or -1) and 1.
         params
             Parameters of the features that it was fitted on; not needed if the first step is `PatchFeatures`.
-            The order of the spatial bins matters: for features computed with
-            ``cv2.resize(image, size).ravel()`` pass ``spatial_order="interleaved"``. The length of a vector
-            does not depend on the order, so that a wrong one cannot be detected, but the scores are wrong.
+            For spatial bins computed with ``cv2.resize(image, size).ravel()`` pass
+            ``spatial_order="interleaved"``: a wrong order cannot be detected, but the scores are wrong.
         metadata
             JSON values to keep in the model file.
 
         Raises
         ------
         InvalidInputError
-            If a step is of another kind or not fitted, the features have another length, `params` differ
-            from those of the pipeline's `PatchFeatures`, or the scaler was fitted on features of images with
-            values 0-1, as which the course reads PNG files. HOG alone, and histograms of LUV and LAB, do not
-            show this.
+            Also if the scaler was fitted on features of images with values 0-1, as which the course reads PNG
+            files. HOG alone, and histograms of LUV and LAB, do not show this.
 
         Examples
         --------
@@ -248,8 +229,14 @@ class VehicleClassifier:
             )
         template = fold_estimators(steps, params.length)
         check_equal_scores(template, steps)
-        if len(steps) > 1:
-            check_uint8(template, params)
+        if len(steps) > 1 and has_unit_range(template.mean, template.scale, params):
+            # Their spatial bins can be converted, but not the HOG of a color channel, whose small differences
+            # the rounding to uint8 removes.
+            raise InvalidInputError(
+                "pipeline must be fitted on features of uint8 images; it was fitted on values 0-1, as which "
+                "the course reads PNG files. Pass imread=vehicle_detection.read_image to extract_features, "
+                "and fit the scaler and the classifier again"
+            )
         return cls(params, (template,), metadata or {})
 
     @cached_property
@@ -283,14 +270,7 @@ class VehicleClassifier:
 
 
 def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassifier:
-    """Load a patch classifier from a model file, or the shipped model ``"highway"``.
-
-    Returns the model with its feature parameters and metadata.
-
-    Parameters
-    ----------
-    path
-        A ``.safetensors`` file written by `VehicleClassifier.save`; None loads ``"highway"``.
+    """Load a patch classifier from a file by `VehicleClassifier.save`, or the shipped model ``"highway"``.
 
     Raises
     ------
@@ -316,11 +296,7 @@ def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassi
 
 
 def split_pipeline(model: Any) -> tuple[FeatureParams | None, list[Any]]:
-    """Split a fitted pipeline, search or ``(classifier, scaler)`` pair: parameters of its features, steps.
-
-    The parameters are those of a first step `PatchFeatures`, None without it. The classifier is the last
-    step.
-    """
+    """Split a pipeline, search or ``(classifier, scaler)`` pair: parameters of its `PatchFeatures`, steps."""
     steps = flatten_steps(model)
     if isinstance(model, (tuple, list)) and len(steps) == 2 and hasattr(steps[0], "predict"):
         steps.reverse()
@@ -358,15 +334,11 @@ def fold_estimators(steps: Sequence[Any], length: int) -> Template:
 
 
 def n_features(estimator: Any) -> int | None:
-    """Return the number of features that a scaler or linear classifier was fitted on; None if unknown.
-
-    Estimators that scikit-learn before 0.24 has pickled lack ``n_features_in_``.
-    """
+    """Return the number of features that a scaler or linear classifier was fitted on; None if unknown."""
     found = getattr(estimator, "n_features_in_", None)
-    if found is not None:
-        return int(found)
-    if not type(estimator).__module__.startswith("sklearn."):
-        return None
+    if found is not None or not type(estimator).__module__.startswith("sklearn."):
+        return found
+    # Estimators that scikit-learn before 0.24 has pickled lack n_features_in_.
     arrays: list[Any] = [getattr(estimator, name, None) for name in ("scale_", "mean_", "center_", "coef_")]
     return next((int(array.shape[-1]) for array in arrays if np.ndim(array)), None)
 
@@ -442,20 +414,6 @@ def check_equal_scores(template: Template, steps: Sequence[Any]) -> None:
     if not np.allclose(scores, expected, rtol=1e-3, atol=1e-3 * float(np.abs(expected).max())):
         names = " and ".join(type(step).__name__ for step in steps)
         raise InvalidInputError(f"pipeline must score by a weighted sum of the features; {names} does not")
-
-
-def check_uint8(template: Template, params: FeatureParams) -> None:
-    """Check that scaled features are not those of images with values 0-1, as the course reads PNG files.
-
-    Such a template is useless for uint8 images. Its spatial bins can be converted, but not the HOG of a color
-    channel, whose small differences the rounding to uint8 removes.
-    """
-    if has_unit_range(template.mean, template.scale, params):
-        raise InvalidInputError(
-            "pipeline must be fitted on features of uint8 images; it was fitted on values 0-1, as which the "
-            "course reads PNG files. Pass imread=vehicle_detection.read_image to extract_features, and fit "
-            "the scaler and the classifier again"
-        )
 
 
 def has_unit_range(mean: Floats, scale: Floats, params: FeatureParams) -> bool:

@@ -20,10 +20,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import (
-    PATCH_SIZE,
-    extract_features,
-)
+from vehicle_detection.features import PATCH_SIZE, extract_features
 from vehicle_detection.search import PixelBand, SearchParams
 from vehicle_detection.svm import CLASSIFIER_REMEDY, VehicleClassifier
 
@@ -49,10 +46,8 @@ def slide_window(
         ``(H, W, 3)`` uint8 RGB; only its shape is used.
     x_start_stop, y_start_stop
         Half-open pixel range of the region; None means the image's border.
-    xy_window
-        Width and height of a window.
-    xy_overlap
-        Horizontal and vertical overlap of neighboring windows as a fraction of their size, in [0, 1).
+    xy_window, xy_overlap
+        Width and height of a window, and the overlap of neighbors as fractions of these, in [0, 1).
 
     Examples
     --------
@@ -105,22 +100,16 @@ def search_windows(
     min_score: float | None = 0.0,
     jobs: int | None = None,
 ) -> Detections:
-    """Classify each window of a list, of any size, as a patch.
-
-    Returns the windows and their scores, in the same order.
+    """Classify each window of a list, cropped and resized to 64x64; return windows and scores in their order.
 
     Parameters
     ----------
-    image
-        ``(H, W, 3)`` uint8 RGB.
-    windows
-        ``(N, 4)`` whole-pixel boxes inside the image, from `slide_window` or elsewhere.
-    classifier
-        Scores the windows, cropped and resized to 64x64.
+    image, windows
+        ``(H, W, 3)`` uint8 RGB, and ``(N, 4)`` whole-pixel boxes inside it, of any size.
+    classifier, jobs
+        As in `find_cars`.
     min_score
         Minimum score of the returned windows (exclusive); None returns all.
-    jobs
-        Threads.
     """
     check_image(image)
     check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
@@ -132,8 +121,7 @@ def search_windows(
         raise InvalidInputError(
             f"windows must be whole pixels; got {given[row].tolist()} in row {row}; round them first"
         )
-    if min_score is not None:
-        min_score = check_number(min_score, "min_score")
+    min_score = -np.inf if min_score is None else check_number(min_score, "min_score")
     height, width = image.shape[:2]
     inside = (boxes[:, :2] >= 0).all(1) & (boxes[:, 2] <= width) & (boxes[:, 3] <= height)
     valid = inside & (boxes[:, 2:] > boxes[:, :2]).all(1)
@@ -148,8 +136,7 @@ def search_windows(
         cv2.resize(image[y1:y2, x1:x2], (PATCH_SIZE, PATCH_SIZE), dst=patch)
     features = extract_features(patches, classifier.params, jobs=jobs)
     scores = classifier.decision_function(features)
-    found = Detections(boxes, scores)
-    return found if min_score is None else found[scores > min_score]
+    return Detections(boxes, scores)[scores > min_score]
 
 
 def find_cars(
@@ -168,13 +155,11 @@ def find_cars(
 
     Parameters
     ----------
-    image
-        ``(H, W, 3)`` uint8 RGB.
-    classifier
-        The trained model.
+    image, classifier
+        ``(H, W, 3)`` uint8 RGB, and the trained model.
     params
-        Bands and minimum score; the default is ``SearchParams.preset("default")``. Steps between windows
-        are rounded to whole cells, at least one.
+        Bands and minimum score, by default ``SearchParams.preset("default")``. Steps between windows are
+        rounded to whole cells, at least one.
     jobs
         Threads, each of which searches a band; the result does not depend on them.
 

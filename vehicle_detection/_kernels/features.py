@@ -7,12 +7,15 @@ which the compiler vectorizes, for any number of channels.
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._kernels.jit import jit
 
 
+@functools.cache
 def orientation_cotangents(orient: int) -> NDArray[np.float32]:
     """Cotangent of the lower bound of each orientation bin, infinite for the first."""
     angles = np.arange(orient) * (np.pi / orient)
@@ -23,28 +26,31 @@ def orientation_cotangents(orient: int) -> NDArray[np.float32]:
     return cotangents.astype(np.float32)
 
 
+@functools.cache
 def degree_bounds(orient: int) -> NDArray[np.float64]:
     """Bounds of the orientation bins in degrees, ``(orient + 1,)``, as scikit-image rounds them."""
     return np.asarray((180.0 / orient) * np.arange(orient + 1), np.float64)
 
 
+@functools.cache
 def bin_of_value(bins: int) -> NDArray[np.intp]:
     """Histogram bin of each value 0-255 when `bins` bins cover ``[0, 256)``; ``(256,)`` intp."""
     return np.arange(256, dtype=np.intp) * bins // 256
 
 
-def sqrt_gradients(source: NDArray[np.uint8]) -> tuple[NDArray[np.float64], ...]:
+def sqrt_gradients(source: NDArray[np.uint8 | np.floating]) -> tuple[NDArray[np.float64], ...]:
     """Gradients of the square root of images, and their arctangents, as scikit-image computes them.
 
-    `source` is ``(..., H, W, C)`` uint8. Returns ``gx``, ``gy`` and ``arctan2(gy, gx)``, ``(..., H, W * C)``
-    float64.
+    `source` is ``(..., H, W, C)`` uint8 or float, not negative. Returns ``gx``, ``gy`` and
+    ``arctan2(gy, gx)``, ``(..., H, W * C)`` float64.
     """
-    root = np.sqrt(np.arange(256.0))[source]
+    root = np.sqrt(np.arange(256.0))[source] if source.dtype == np.uint8 else np.sqrt(source)
     gx, gy = np.zeros_like(root), np.zeros_like(root)
     np.subtract(root[..., :, 2:, :], root[..., :, :-2, :], out=gx[..., :, 1:-1, :])
     np.subtract(root[..., 2:, :, :], root[..., :-2, :, :], out=gy[..., 1:-1, :, :])
     shape = (*root.shape[:-2], -1)
-    return gx.reshape(shape), gy.reshape(shape), np.arctan2(gy, gx).reshape(shape)
+    gx, gy = (part.reshape(shape).astype(np.float64, copy=False) for part in (gx, gy))
+    return gx, gy, np.arctan2(gy, gx)
 
 
 # Columns of a tile: its gradients and histograms (10 rows of floats) fit into the first-level cache.
@@ -71,7 +77,7 @@ def hog_cells(image, channels, cell, cotangents, cells):
     size = per_tile * span
     quotient, magnitude = np.empty(size, np.float32), np.empty(size, np.float32)
     fours, eights = np.empty(size, np.float32), np.empty(size, np.float32)
-    reduced = np.empty((orient, channels, per_tile), np.float32)
+    reduced = np.zeros((orient + 1, channels, per_tile), np.float32)  # nothing is beyond the last bound
     sums = np.empty((orient, size), np.float32)
     scale = np.float32(1.0 / (cell * cell))
     for row in range(rows):
@@ -85,14 +91,10 @@ def hog_cells(image, channels, cell, cotangents, cells):
             _sum_columns(sums, cell, channels, count, fours, eights, reduced)
             for channel in range(channels):
                 for k in range(orient):
-                    out, within = cells[channel, k, row, first : first + count], reduced[k, channel]
-                    if k + 1 < orient:
-                        past = reduced[k + 1, channel]
-                        for column in range(count):
-                            out[column] = (within[column] - past[column]) * scale
-                    else:
-                        for column in range(count):
-                            out[column] = within[column] * scale
+                    out = cells[channel, k, row, first : first + count]
+                    within, past = reduced[k, channel], reduced[k + 1, channel]
+                    for column in range(count):
+                        out[column] = (within[column] - past[column]) * scale
 
 
 @jit
@@ -239,14 +241,12 @@ def normalize_blocks(cells, block, dilation, blocks):
     the constants of scikit-image.
     """
     channels, orient, rows, columns = cells.shape
-    height = rows - (block - 1) * dilation
-    eps = np.float32(1e-10)
-    clip = np.float32(0.2)
-    one = np.float32(1)
-    width = columns - (block - 1) * dilation
+    height, width = rows - (block - 1) * dilation, columns - (block - 1) * dilation
+    eps, clip, one = np.float32(1e-10), np.float32(0.2), np.float32(1)
     energy = np.empty((rows, columns), np.float32)
     scale = np.empty(width, np.float32)
     clipped = np.empty(width, np.float32)
+    blocks[:, :, :, :, height:] = 0
     for channel in range(channels):
         energy.fill(np.float32(0))
         for k in range(orient):
@@ -283,11 +283,6 @@ def normalize_blocks(cells, block, dilation, blocks):
                         for x in range(width):
                             out[x] *= clipped[x]
                         out[width:].fill(np.float32(0))
-        for y in range(height, rows):
-            for i in range(block):
-                for j in range(block):
-                    for k in range(orient):
-                        blocks[channel, i, j, k, y].fill(np.float32(0))
 
 
 @jit
@@ -410,15 +405,12 @@ def histogram_cells(image, table, cell, cells):
     side of a cell in pixels, and `cells` the output ``(cell rows, cell columns)`` float32.
     """
     rows, columns = cells.shape
+    cells[:] = 0
     for row in range(rows):
-        for column in range(columns):
-            cells[row, column] = 0
         for y in range(row * cell, (row + 1) * cell):
             line = image[y]
             for column in range(columns):
-                first = np.float32(0)
-                second = np.float32(0)
-                third = np.float32(0)
+                first, second, third = np.float32(0), np.float32(0), np.float32(0)
                 for x in range(column * cell, (column + 1) * cell):
                     first += table[0, line[x, 0]]
                     second += table[1, line[x, 1]]

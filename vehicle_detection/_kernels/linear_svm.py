@@ -48,18 +48,9 @@ def fit_svm(
     scale /= gains
     center, squares = mean.astype(np.float32), (scale**-2).astype(np.float32)
     weights = np.zeros(features.shape[1], np.float32)
-    intercept = _descend(
-        features,
-        chosen,
-        2.0 * labels[chosen] - 1,
-        0.5 / costs[chosen],
-        center,
-        squares,
-        weights,
-        _TOLERANCE,
-        _MAX_SWEEPS,
-        np.random.default_rng(random_state),
-    )
+    problem = features, chosen, 2.0 * labels[chosen] - 1, 0.5 / costs[chosen]
+    rng = np.random.default_rng(random_state)
+    intercept = _descend(*problem, center, squares, weights, _TOLERANCE, _MAX_SWEEPS, rng)
     coef = weights * scale
     # The solver used the mean rounded to float32.
     return LinearSVM(mean, scale, coef, float(intercept + coef / scale @ (mean - center)))

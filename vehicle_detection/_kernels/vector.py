@@ -65,19 +65,7 @@ def block_adder(block: Block) -> Callable[..., None]:
     """
 
     @intrinsic
-    def add_products(
-        _context: Any,
-        weights: Any,
-        first: Any,
-        last: Any,
-        cells: Any,
-        start: Any,
-        stride: Any,
-        step: Any,
-        sums: Any,
-        position: Any,
-        row_step: Any,
-    ) -> Any:
+    def add_products(_, weights, first, last, cells, start, stride, step, sums, position, row_step):
         size = types.intp
         signature = types.void(weights, size, size, cells, size, size, size, sums, size, size)
         return signature, lambda context, builder, _, arguments: _generate(

@@ -4,7 +4,6 @@ The course is project 5 of Udacity's Self-Driving Car Engineer Nanodegree
 (https://github.com/udacity/CarND-Vehicle-Detection). After ``from vehicle_detection.course import *``, the
 functions of its ``lesson_functions.py`` and of its HOG sub-sampling quiz, ``find_cars``, are available with
 their argument order, defaults and return types. Options that the lesson does not have are keyword-only.
-`set_lesson_defaults` sets the defaults in which published versions of the lesson differ.
 
 Images are ``(H, W, 3)`` RGB, uint8 or float, as in the lesson; windows and boxes are lists of corner pairs
 ``((x1, y1), (x2, y2))``. HOG is computed by the library's kernels. For uint8 images, the library's
@@ -12,11 +11,8 @@ Images are ``(H, W, 3)`` RGB, uint8 or float, as in the lesson; windows and boxe
 a ``StandardScaler``. Everything else takes the lesson's own steps: features, ``scaler.transform``,
 ``clf.predict``. Both ways agree within float32 precision.
 
-The names that the import of ``lesson_functions.py`` brings along are here as well: ``np``, ``cv2``, ``mpimg``
-(``matplotlib.image``) and scikit-image's ``hog``.
-
-The page ``docs/course.md`` lists the differences from the lesson and the counterpart of each function in the
-main API.
+The names that ``lesson_functions.py`` imports are here as well: ``np``, ``cv2``, ``mpimg`` and ``hog``.
+The page ``docs/course.md`` lists the differences from the lesson and counterparts in the main API.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -29,11 +25,12 @@ from vehicle_detection.course.features import (
     bin_spatial,
     color_hist,
     convert_color,
+    extract_features,
     get_hog_features,
     set_lesson_defaults,
+    single_img_features,
 )
 from vehicle_detection.course.search import find_car_windows, find_cars, search_windows
-from vehicle_detection.course.vectors import extract_features, single_img_features
 from vehicle_detection.course.windows import (
     add_heat,
     apply_threshold,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -45,33 +46,19 @@ class HeatmapDetector(VehicleDetector):
         ``predict``, which needs `scaler` unless it is a pipeline.
     scaler
         The fitted scaler with ``transform`` of such a classifier.
-    ystart, ystop
-        Rows to search in a 1280x720 frame; they scale with the frame.
-    scales
-        Sides of the windows divided by 64 pixels, in a frame 1280 wide.
+    ystart, ystop, scales
+        Rows to search in a 1280x720 frame, and sides of the windows divided by 64 pixels; they scale with it.
     cells_per_step
         Step between windows in cells of 8 pixels.
-    threshold
-        A pixel is hot if more than this number of windows hit it, as the mean over the frames. None: chosen
-        for the density of the windows.
-    n_frames
-        Number of frames over which the heat is averaged.
+    threshold, n_frames
+        A pixel is hot if more than this number of windows hit it, as the mean over so many frames. None:
+        chosen for the density of the windows.
     **options
         For a classifier with `scaler`, the features that it was trained on: arguments of `find_car_windows`
         such as ``orient`` (default 9), ``pix_per_cell`` (8), ``cell_per_block`` (2), ``spatial_size``
         ((32, 32)), ``hist_bins`` (32), ``color_space``, ``transform_sqrt`` and ``divide_by``.
 
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed.
-    ModelFileError
-        If the model file is missing or damaged, or is not a classifier of patches.
-
-    Warns
-    -----
-    UserWarning
-        If the threshold cannot fit the density of the windows.
+    A warning says if the threshold cannot fit the density of the windows.
 
     Examples
     --------
@@ -111,10 +98,15 @@ class HeatmapDetector(VehicleDetector):
                     "clf must be a model of the library, or a fitted classifier with a scaler; got "
                     f"{describe(clf)} and {describe(scaler)}; pass the scaler, or a pipeline of both"
                 )
-            search_hits = _WindowSearch(clf, scaler, (ystart, ystop), tuple(scales), cells_per_step, options)
-            model = FunctionModel(
-                function=search_hits, score="logit", thread_safe=True, name="find_car_windows"
-            )
+            defaults = {"orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "spatial_size": (32, 32)}
+            options = {**defaults, "hist_bins": 32, "cells_per_step": cells_per_step, **options}
+            # Later changes of the default must not change a detector.
+            options["transform_sqrt"] = or_default(options.get("transform_sqrt"), "transform_sqrt")
+            hits = _WindowSearch((ystart, ystop), scales, {"svc": clf, "X_scaler": scaler, **options})
+            # An image of one window checks the options, the estimators and the range before the first frame.
+            white = np.full((PATCH_SIZE, PATCH_SIZE, 3), 255, np.uint8)
+            find_car_windows(white, None, None, 1, **hits.arguments)
+            model = FunctionModel(function=hits, score="logit", thread_safe=True, name="find_car_windows")
             camera = Camera.dashcam(horizon=_HORIZON)
             super().__init__(model, region_params=heat.for_search(search), camera=camera)
         self._warned = True  # the course shows no speeds
@@ -135,15 +127,7 @@ class HeatmapDetector(VehicleDetector):
         return array, count
 
     def annotate(self, frame: NDArray[np.uint8], result: FrameResult) -> NDArray[np.uint8]:
-        """Draw the boxes of the hot regions on a copy of the frame, in the course's style.
-
-        Returns a new frame of the same shape.
-
-        Parameters
-        ----------
-        frame, result
-            As in `VehicleDetector.annotate`.
-        """
+        """Draw the boxes of the hot regions on a copy of the frame, in the course's style."""
         if self.annotator.diagnostics:
             return super().annotate(frame, result)
         check_type(result, "result", FrameResult, "pass what process or track returns")
@@ -155,45 +139,28 @@ def _search_params(ystart: int, ystop: int, scales: Sequence[float], cells_per_s
     top = check_integer(ystart, "ystart", low=0)
     bottom = check_integer(ystop, "ystop", low=top + 1)
     overlap = 1 - check_integer(cells_per_step, "cells_per_step", low=1, high=8) / 8
-    given: object = scales
-    if not isinstance(given, (tuple, list, np.ndarray)) or not len(given):
-        raise InvalidInputError(
-            f"scales must be a list of numbers such as (1.0, 1.5), got {describe(scales)}"
-        )
-    sides = [PATCH_SIZE * check_number(scale, "scales", low=0.25, high=20) for scale in given]
+    if not len(scales):
+        raise InvalidInputError("scales must hold a number at least, such as (1.0, 1.5); got none")
+    sides = [PATCH_SIZE * check_number(scale, "scales", low=0.25, high=20) for scale in scales]
     y = (top - 400.0, bottom - 400.0)
     bands = tuple(SearchBand(window=(side, side), y=y, overlap=(overlap, overlap)) for side in sides)
     return SearchParams(bands=bands, horizon=_HORIZON)
 
 
+@dataclass(frozen=True, eq=False)
 class _WindowSearch:
     """The hits of ``find_cars`` at several scales: boxes, and scores of 1."""
 
-    def __init__(
-        self,
-        clf: Any,
-        scaler: Any,
-        rows: tuple[int, int],
-        scales: tuple[float, ...],
-        cells_per_step: int,
-        options: dict[str, Any],
-    ) -> None:
-        self._rows, self._scales = rows, scales
-        defaults = {"orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "spatial_size": (32, 32)}
-        self._arguments = {"svc": clf, "X_scaler": scaler, "cells_per_step": cells_per_step}
-        self._arguments |= defaults | {"hist_bins": 32} | options
-        # Later changes of the default must not change a detector.
-        self._arguments["transform_sqrt"] = or_default(options.get("transform_sqrt"), "transform_sqrt")
-        # An image of one window checks the options, the estimators and the range before the first frame.
-        white = np.full((PATCH_SIZE, PATCH_SIZE, 3), 255, np.uint8)
-        find_car_windows(white, None, None, 1, **self._arguments)
+    rows: tuple[int, int]
+    scales: tuple[float, ...]
+    arguments: dict[str, Any]
 
     def __call__(self, image: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[np.float64]]:
         factor = max(image.shape) / REFERENCE_WIDTH
-        ystart, ystop = (round(row * factor) for row in self._rows)
+        ystart, ystop = (round(row * factor) for row in self.rows)
         hits = [
             box
-            for scale in self._scales
-            for box in find_car_windows(image, ystart, ystop, scale * factor, **self._arguments)
+            for scale in self.scales
+            for box in find_car_windows(image, ystart, ystop, scale * factor, **self.arguments)
         ]
         return np.array(hits, np.float64).reshape(-1, 4), np.ones(len(hits))

@@ -1,53 +1,68 @@
-"""Features of one image: color conversion, HOG, spatial bins and color histograms; their defaults."""
+"""The features of the lesson, ``[spatial | histogram | HOG]``: functions, options and their defaults."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any, Literal
+import functools
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import MISSING, dataclass
+from typing import Any, Literal, ParamSpec, Self, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection import features as library
 from vehicle_detection._common import (
+    Checked,
     check_array,
     check_choice,
     check_flags,
     check_integer,
     check_number,
     check_type,
+    checked_field,
+    choice,
     describe,
+    integer,
+    is_listing,
 )
-from vehicle_detection._kernels import degree_bounds, orientation_cotangents, sqrt_gradients
 from vehicle_detection._kernels import features as kernels
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import COLOR_SPACES, SPATIAL_ORDERS
+from vehicle_detection.features import COLOR_SPACES, PATCH_SIZE, SPATIAL_ORDERS, FeatureParams
+from vehicle_detection.images import read_image
 
 Image = NDArray[Any]
+Images = list[Image] | NDArray[Any]
 Size = int | Sequence[int]
 SpatialOrder = Literal["interleaved", "channels"]
-
 Formula = Literal["old", "new"]
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
 FORMULAS = ("old", "new")
 # OpenCV's names of the color spaces by their name in upper case.
 _OPENCV_SPACES = {space.upper(): space for space in (*COLOR_SPACES, "BGR", "GRAY")}
-
-
-@dataclasses.dataclass(frozen=True)
-class _Defaults:
-    transform_sqrt: bool = False
-    formula: Formula = "old"
-
-
-_defaults = _Defaults()
+# Number of images that are read and processed at a time.
+_CHUNK = 4096
+# Values of the options of a group of features that is switched off.
+_UNUSED: dict[str, dict[str, Any]] = {
+    "spatial_feat": {"spatial_size": (32, 32)},
+    "hist_feat": {"hist_bins": 32, "hist_range": (0, 256)},
+    "hog_feat": {"orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "hog_channel": 0},
+}
+_defaults: dict[str, Any] = {"transform_sqrt": False, "formula": "old"}
+# The options of earlier calls.
+_checked: dict[str, FeatureOptions] = {}
+_MAX_CHECKED = 64
 
 
 def set_lesson_defaults(*, transform_sqrt: bool | None = None, formula: Formula | None = None) -> None:
     """Set the defaults in which published versions of ``lesson_functions.py`` differ.
 
-    They hold for all later calls in this process that do not pass the option. A `HeatmapDetector` keeps those
-    of its construction. None leaves a default as it is.
+    They hold for later calls in this process that do not pass the option; a `HeatmapDetector` keeps those of
+    its construction. None leaves a default as it is.
 
     Parameters
     ----------
@@ -55,13 +70,8 @@ def set_lesson_defaults(*, transform_sqrt: bool | None = None, formula: Formula 
         Default of all functions that compute HOG, initially False. True if your own file calls
         scikit-image's ``hog`` with ``transform_sqrt=True``, as most published ones do.
     formula
-        Default of `slide_window`, initially ``"old"``. ``"new"`` if your own ``slide_window`` computes
-        ``nx_buffer``. `find_cars` keeps its own default.
-
-    Raises
-    ------
-    InvalidInputError
-        If a value is invalid; no default changes then.
+        Default of `slide_window`, but not of `find_cars`, initially ``"old"``. ``"new"`` if your own
+        ``slide_window`` computes ``nx_buffer``.
 
     Examples
     --------
@@ -73,32 +83,25 @@ def set_lesson_defaults(*, transform_sqrt: bool | None = None, formula: Formula 
     3
     >>> set_lesson_defaults(formula="old")
     """
-    global _defaults
-    given: dict[str, Any] = {}
-    if transform_sqrt is not None:
-        check_flags(transform_sqrt=transform_sqrt)
-        given["transform_sqrt"] = bool(transform_sqrt)
-    if formula is not None:
-        check_choice(formula, "formula", FORMULAS)
-        given["formula"] = formula
-    _defaults = dataclasses.replace(_defaults, **given)
+    root, formula = or_default(transform_sqrt, "transform_sqrt"), or_default(formula, "formula")
+    check_choice(formula, "formula", FORMULAS)
+    _defaults.update(transform_sqrt=_check_switch(root, "transform_sqrt"), formula=formula)
 
 
 def or_default(value: Any, name: str) -> Any:
     """Return an option's value, or its default if it is None."""
-    return getattr(_defaults, name) if value is None else value
+    return _defaults[name] if value is None else value
 
 
 def check_lesson_image(img: Any, name: str = "img", *, drop_alpha: bool = False) -> Image:
     """Return an ``(H, W, 3)`` image as uint8 or float32; `drop_alpha` accepts a fourth channel."""
-    has_alpha = isinstance(img, np.ndarray) and img.ndim == 3 and img.shape[2] == 4
-    if has_alpha and drop_alpha:
+    if isinstance(img, np.ndarray) and img.ndim == 3 and img.shape[2] == 4:
+        if not drop_alpha:
+            raise InvalidInputError(
+                f"{name} must be an (H, W, 3) RGB array, got {describe(img)}; drop the alpha channel with "
+                f"{name}[..., :3]"
+            )
         img = np.ascontiguousarray(img[..., :3])
-    elif has_alpha:
-        raise InvalidInputError(
-            f"{name} must be an (H, W, 3) RGB array, got {describe(img)}; drop the alpha channel with "
-            f"{name}[..., :3]"
-        )
     if not isinstance(img, np.ndarray) or img.ndim != 3 or img.shape[2] != 3 or not img.size:
         raise InvalidInputError(f"{name} must be an (H, W, 3) RGB array; got {describe(img)}")
     if img.dtype in (np.uint8, np.float32):
@@ -128,10 +131,14 @@ def check_range(limits: Any, name: str) -> tuple[float, float] | None:
     return low, check_number(limits[1], name, above=low)
 
 
-def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
-    """Convert the color space of an image, by the name of OpenCV's conversion.
+def _check_switch(value: Any, name: str) -> bool:
+    """Return a switch as a bool; the lesson's code also passes 0 and 1."""
+    check_flags(**{name: value})
+    return bool(value)
 
-    Returns a new image, uint8 or float32.
+
+def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
+    """Convert the color space by the name of OpenCV's conversion: a new image, uint8 or float32.
 
     Parameters
     ----------
@@ -139,9 +146,8 @@ def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
         ``(H, W, 3)`` uint8, or float as OpenCV defines it: 0-1, hue 0-360, LUV and LAB with negative values.
         A fourth channel is left out.
     conv
-        ``"RGB2YCrCb"``, ``"BGR2YCrCb"``, ``"RGB2LUV"``, ``"RGB2HLS"``, ``"RGB2GRAY"``, ..., or an inverse
-        such as ``"YCrCb2RGB"``, in upper or lower case; a color space alone, such as ``"LUV"``, means from
-        RGB.
+        ``"RGB2YCrCb"``, ``"BGR2LUV"``, ``"RGB2GRAY"``, ..., or an inverse such as ``"YCrCb2RGB"``, in upper
+        or lower case; a color space alone, such as ``"LUV"``, means from RGB.
 
     Examples
     --------
@@ -175,30 +181,23 @@ def get_hog_features(
 ) -> Any:
     """HOG of one channel, with a picture of it if `vis` is set.
 
+    Returns 1-D, or ``(block rows, block columns, cell_per_block, cell_per_block, orient)``; float64, or
+    float32 for a float32 image. With `vis`, a pair of this and a picture ``(H, W)``. Blocks are normalized by
+    L2-Hys, scikit-image's default since version 0.15.
+
     Parameters
     ----------
     img
         ``(H, W)``, one channel, uint8 or float.
-    orient
-        Orientations over 0-180 degrees.
-    pix_per_cell, cell_per_block
-        Side of a cell in pixels and of a block in cells.
+    orient, pix_per_cell, cell_per_block
+        Orientations over 0-180 degrees; sides of a cell in pixels and of a block in cells.
     vis, visualise, visualize
         Return a pair of the features and the picture.
     feature_vec
         Return the features as a vector; False gives the array of blocks.
     transform_sqrt
         Take the square root of the values first. The course has published both: a model trained one way does
-        not work the other way. None is the default of `set_lesson_defaults`, initially False. Float channels
-        must not be negative for True.
-
-    Returns
-    -------
-    features : numpy.ndarray
-        1-D, or ``(block rows, block columns, cell_per_block, cell_per_block, orient)``; float64, or float32
-        for a float32 image. Blocks are normalized by L2-Hys, scikit-image's default since version 0.15.
-    hog_image : numpy.ndarray
-        ``(H, W)``, only with `vis`.
+        not work the other way. None is the default of `set_lesson_defaults`. No negative values for True.
 
     Examples
     --------
@@ -214,12 +213,11 @@ def get_hog_features(
             f"img must be one (H, W) channel of numbers, got {describe(img)}; pick one with image[..., 0]"
         )
     check_flags(vis=vis, visualise=visualise, visualize=visualize, feature_vec=feature_vec)
-    transform_sqrt = or_default(transform_sqrt, "transform_sqrt")
-    check_flags(transform_sqrt=transform_sqrt)
+    transform_sqrt = _check_switch(or_default(transform_sqrt, "transform_sqrt"), "transform_sqrt")
     sizes = {"orient": orient, "pix_per_cell": pix_per_cell, "cell_per_block": cell_per_block}
     orient, pix_per_cell, cell_per_block = (check_integer(size, name, low=1) for name, size in sizes.items())
     channel = img if img.dtype in (np.uint8, np.float32) else img.astype(np.float64)
-    blocks = hog_blocks(channel[..., None], orient, pix_per_cell, cell_per_block, bool(transform_sqrt))[0]
+    blocks = hog_blocks(channel[..., None], orient, pix_per_cell, cell_per_block, transform_sqrt)[0]
     blocks = np.ascontiguousarray(blocks, np.float32 if channel.dtype == np.float32 else np.float64)
     features = blocks.ravel() if feature_vec else blocks
     if not (vis or visualise or visualize):
@@ -239,24 +237,20 @@ def bin_spatial(
     color_space: str = "RGB",
     order: SpatialOrder = "interleaved",
 ) -> NDArray[Any]:
-    """Pixel values of a resized image as a vector.
-
-    Returns ``(width * height * 3,)``, or ``(width * height,)`` of one channel, of the image's dtype.
+    """Pixel values of a resized image, ``(width * height * channels,)`` of its dtype.
 
     Parameters
     ----------
     img
         ``(H, W, 3)``, or one channel ``(H, W)``, uint8 or float. A fourth channel is left out.
-    size
-        ``(width, height)`` to resize to, or one number for both.
-    last_size
-        The size, if the color space comes first, as in an early quiz: ``bin_spatial(img, "HSV", (16, 16))``.
+    size, last_size
+        ``(width, height)`` to resize to, or one number for both. It may follow the color space, as in an
+        early quiz: ``bin_spatial(img, "HSV", (16, 16))``.
     color_space
         Color space to convert to first, from RGB.
     order
-        ``"interleaved"``: pixel by pixel, ``cv2.resize(img, size).ravel()``, as in the lesson.
-        ``"channels"``: one channel after the other, as in the HOG sub-sampling quiz and in the main API. A
-        model trained on one order does not work on the other.
+        ``"interleaved"``: pixel by pixel, as in the lesson. ``"channels"``: one channel after the other, as
+        in the HOG sub-sampling quiz and the main API. A model trained on one order needs this order.
 
     Examples
     --------
@@ -272,29 +266,23 @@ def bin_spatial(
         color_space, size = size, last_size[0] if last_size else (32, 32)
     elif last_size:
         raise InvalidInputError(f"bin_spatial takes an image and a size; got {len(last_size)} more")
-    if one_channel:
-        if color_space != "RGB":
-            raise InvalidInputError(f"color_space must be RGB for one channel; got {describe(color_space)}")
-        return np.asarray(cv2.resize(image[..., 0], check_size(size, "size"))).ravel()
+    if one_channel and color_space != "RGB":
+        raise InvalidInputError(f"color_space must be RGB for one channel; got {describe(color_space)}")
     if color_space != "RGB":
         image = convert_color(image, color_space)
-    small = np.asarray(cv2.resize(image, check_size(size, "size")))
-    return small.ravel() if order == "interleaved" else small.transpose(2, 0, 1).ravel()
+    small = np.asarray(cv2.resize(image[..., 0] if one_channel else image, check_size(size, "size")))
+    return (small if one_channel or order == "interleaved" else small.transpose(2, 0, 1)).ravel()
 
 
 def color_hist(
     img: Image, nbins: int = 32, bins_range: tuple[float, float] | None = (0, 256)
 ) -> NDArray[np.int64]:
-    """Histogram of each channel, one after the other.
-
-    Returns ``(3 * nbins,)`` int64 counts.
+    """Histogram of each channel, one after the other: ``(3 * nbins,)`` int64 counts.
 
     Parameters
     ----------
-    img
-        ``(H, W, 3)``, uint8 or float. A fourth channel is left out.
-    nbins
-        Bins of each channel.
+    img, nbins
+        ``(H, W, 3)``, uint8 or float, of which a fourth channel is left out; bins of each channel.
     bins_range
         Values that the bins cover. With the default, all values of a 0-1 image fall into the first bin: pass
         ``(0, 1)``. None takes each channel's own minimum and maximum, as the HOG sub-sampling quiz does.
@@ -316,18 +304,6 @@ def hog_blocks(
     image: Image, orient: int, pix_per_cell: int, cell_per_block: int, transform_sqrt: bool = False
 ) -> NDArray[np.float32]:
     """HOG of each channel: ``(channels, rows, columns, block, block, orient)`` float32, a view."""
-    maps = hog_maps(image, orient, pix_per_cell, cell_per_block, transform_sqrt)
-    rows, columns = (count - cell_per_block + 1 for count in maps.shape[4:])
-    return maps[..., :rows, :columns].transpose(0, 4, 5, 1, 2, 3)
-
-
-def hog_maps(
-    image: Image, orient: int, pix_per_cell: int, cell_per_block: int, transform_sqrt: bool = False
-) -> NDArray[np.float32]:
-    """HOG of each channel: ``(channels, block, block, orient, cell rows, cell columns)`` float32.
-
-    The last ``cell_per_block - 1`` rows and columns hold no whole block.
-    """
     cell, block = pix_per_cell, cell_per_block
     height, width, channels = image.shape
     side = cell * block
@@ -336,30 +312,11 @@ def hog_maps(
             f"img must be at least one block large ({side}x{side} pixels); got {width}x{height}"
         )
     cells = np.empty((channels, orient, height // cell, width // cell), np.float32)
-    if transform_sqrt:
-        gradients = sqrt_gradients(image) if image.dtype == np.uint8 else _sqrt_gradients(image)
-        kernels.sum_orientations(*gradients, degree_bounds(orient), channels, cell, cells)
-    else:
-        flat = np.ascontiguousarray(image).reshape(height, -1)
-        kernels.hog_cells(flat, channels, cell, orientation_cotangents(orient), cells)
+    library.hog_cells(image, orient, cell, transform_sqrt, cells)
     blocks = np.empty((channels, block, block, *cells.shape[1:]), np.float32)
     kernels.normalize_blocks(cells, block, 1, blocks)
-    return blocks
-
-
-def _sqrt_gradients(image: NDArray[Any]) -> tuple[NDArray[np.float64], ...]:
-    """Gradients of the square root of a float image and their arctangents, like `sqrt_gradients`."""
-    if image.min() < 0:
-        raise InvalidInputError(
-            "transform_sqrt must be False for negative values, which float LUV and LAB images have; "
-            "convert a uint8 image, or switch it off"
-        )
-    image = np.sqrt(image)
-    across, down = np.zeros_like(image), np.zeros_like(image)
-    across[:, 1:-1] = image[:, 2:] - image[:, :-2]
-    down[1:-1] = image[2:] - image[:-2]
-    gx, gy = (part.reshape(len(image), -1).astype(np.float64) for part in (across, down))
-    return gx, gy, np.arctan2(gy, gx)
+    rows, columns = (count - block + 1 for count in cells.shape[2:])
+    return blocks[..., :rows, :columns].transpose(0, 4, 5, 1, 2, 3)
 
 
 def bin_indices(image: Image, bins: int, limits: tuple[float, float]) -> NDArray[np.intp]:
@@ -375,3 +332,269 @@ def count_bins(indices: NDArray[np.intp], bins: int) -> NDArray[np.int64]:
     """Histogram of each channel from `bin_indices`, one after the other."""
     separate = (indices + np.arange(3) * (bins + 1)).ravel()
     return np.bincount(separate, minlength=3 * (bins + 1)).reshape(3, -1)[:, :bins].ravel()
+
+
+def accept_cspace(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Accept ``cspace=``, the name of ``color_space=`` in two earlier quizzes.
+
+    Each of them computes one group of features, HOG or spatial bins and histograms. Without the switches
+    ``spatial_feat=`` ..., the group follows from the options. The HOG quiz's positional order is an error.
+    """
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Result:
+        # A number as spatial_size and a channel as pix_per_cell show the order of the HOG quiz.
+        is_number = [isinstance(value, (int, np.integer)) for value in args]
+        if len(args) > 5 and is_number[2] and (isinstance(args[5], str) or (is_number[5] and args[5] <= 3)):
+            names = ("cspace", "orient", "pix_per_cell", "cell_per_block", "hog_channel")
+            named = ", ".join(f"{name}={value!r}" for name, value in zip(names, args[1:]))
+            raise InvalidInputError(
+                "the arguments after color_space must be spatial_size, hist_bins, orient, pix_per_cell, ...; "
+                f"got those of the HOG quiz in its order. Pass them by name: {named}"
+            )
+        if "cspace" in kwargs:
+            if "color_space" in kwargs:
+                raise InvalidInputError("color_space and cspace are the same option; pass one of them")
+            kwargs["color_space"] = kwargs.pop("cspace")
+            color = not kwargs.keys().isdisjoint({"spatial_size", "hist_bins", "hist_range"})
+            hog = not kwargs.keys().isdisjoint({"orient", "pix_per_cell", "cell_per_block", "hog_channel"})
+            if color != hog and kwargs.keys().isdisjoint({"spatial_feat", "hist_feat", "hog_feat"}):
+                kwargs.update(spatial_feat=color, hist_feat=color, hog_feat=hog)
+        return function(*args, **kwargs)
+
+    return call
+
+
+@accept_cspace
+def single_img_features(
+    img: Image,
+    color_space: str = "RGB",
+    spatial_size: Size = (32, 32),
+    hist_bins: int = 32,
+    orient: int = 9,
+    pix_per_cell: int = 8,
+    cell_per_block: int = 2,
+    hog_channel: int | str = 0,
+    spatial_feat: bool = True,
+    hist_feat: bool = True,
+    hog_feat: bool = True,
+    vis: bool = False,
+    *,
+    hist_range: tuple[float, float] | None = (0, 256),
+    transform_sqrt: bool | None = None,
+    spatial_order: SpatialOrder = "interleaved",
+) -> Any:
+    """Feature vector of one image; the options are those of `extract_features`.
+
+    Returns 1-D float64, ``[spatial | histogram | HOG]``; with `vis`, a pair of it and a picture of the HOG of
+    a single `hog_channel`, ``(H, W)`` float64.
+
+    Examples
+    --------
+    >>> single_img_features(np.zeros((64, 64, 3), np.uint8), "YCrCb", hog_channel="ALL").shape
+    (8460,)
+    """
+    options, image = FeatureOptions.of(locals()), check_lesson_image(img, drop_alpha=True)
+    check_flags(vis=vis)
+    features = options.compute([image])[0].astype(np.float64)
+    if not vis:
+        return features
+    if not options.hog_feat:
+        raise InvalidInputError("vis needs hog_feat=True, got False; omit vis")
+    if options.hog_channel == "ALL":
+        raise InvalidInputError("vis needs the HOG of one channel, got 'ALL'; pass hog_channel=0, 1 or 2")
+    channel = convert_color(image, options.color_space)[..., int(options.hog_channel)]
+    sizes = options.orient, options.pix_per_cell, options.cell_per_block
+    _, picture = get_hog_features(channel, *sizes, vis=True, transform_sqrt=options.transform_sqrt)
+    return features, picture
+
+
+@accept_cspace
+def extract_features(
+    imgs: Iterable[str | os.PathLike[str] | Image],
+    color_space: str = "RGB",
+    spatial_size: Size = (32, 32),
+    hist_bins: int = 32,
+    orient: int = 9,
+    pix_per_cell: int = 8,
+    cell_per_block: int = 2,
+    hog_channel: int | str = 0,
+    spatial_feat: bool = True,
+    hist_feat: bool = True,
+    hog_feat: bool = True,
+    *,
+    hist_range: tuple[float, float] | None = (0, 256),
+    transform_sqrt: bool | None = None,
+    spatial_order: SpatialOrder = "interleaved",
+    imread: Callable[[str], Image] | None = None,
+) -> list[NDArray[Any]]:
+    """Feature vectors of a list of images.
+
+    Returns a 1-D vector for each image, ``[spatial | histogram | HOG]``: float32 for 64x64 uint8 images,
+    which the library's kernels compute, float64 for others.
+
+    Parameters
+    ----------
+    imgs
+        File names, or images ``(H, W, 3)`` RGB. A fourth channel, transparency, is dropped.
+    color_space
+        ``"RGB"``, ``"HSV"``, ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or ``"LAB"``. The keyword of two
+        earlier quizzes, ``cspace=``, is accepted too: with HOG options only, it selects HOG alone, and with
+        color options only, spatial bins and histograms alone, as in those quizzes.
+    spatial_size, hist_bins, hist_range, spatial_order
+        See `bin_spatial` and `color_hist`.
+    orient, pix_per_cell, cell_per_block, transform_sqrt
+        See `get_hog_features`.
+    hog_channel, spatial_feat, hist_feat, hog_feat
+        0, 1, 2 or ``"ALL"``, and switches for the three parts.
+    imread
+        Function that reads a file as RGB. None reads like ``mpimg.imread``: a PNG as float 0-1, other files
+        as uint8. ``vehicle_detection.read_image`` reads every file as uint8, which is faster; search uint8
+        images then, and pass ``divide_by=1`` to `find_cars`.
+
+    Examples
+    --------
+    >>> images = [np.zeros((64, 64, 3), np.uint8)] * 2
+    >>> [len(vector) for vector in extract_features(images, cspace="HLS", orient=9)]
+    [1764, 1764]
+    """
+    options, read = FeatureOptions.of(locals()), imread or _read_like_lesson
+    if not is_listing(imgs):
+        raise InvalidInputError(f"imgs must be a list of file names or images; got {describe(imgs)}")
+    if isinstance(imgs, np.ndarray) and imgs.ndim in (2, 3) and imgs.dtype.kind in "uif":
+        raise InvalidInputError(
+            f"imgs must be a list of images, got {describe(imgs)}; pass [image], or use single_img_features"
+        )
+    if not callable(read):
+        raise InvalidInputError(f"imread must be a function of a file name; got {describe(imread)}")
+    if isinstance(imgs, np.ndarray) and are_uint8_patches(imgs):
+        return options.compute(imgs)
+    items: list[Any] = list(imgs)
+    vectors: list[NDArray[Any]] = []
+    for start in range(0, len(items), _CHUNK):
+        images = []
+        for index, item in enumerate(items[start : start + _CHUNK], start):
+            image = read(os.fspath(item)) if isinstance(item, (str, os.PathLike)) else item
+            images.append(check_lesson_image(image, f"imgs[{index}]", drop_alpha=True))
+        vectors += options.compute(images)
+    return vectors
+
+
+def _read_like_lesson(path: str) -> Image:
+    image = read_image(path)
+    return np.divide(image, 255, dtype=np.float32) if path.lower().endswith(".png") else image
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureOptions(Checked):
+    """The feature options of a lesson function, checked."""
+
+    color_space: str = choice(MISSING, COLOR_SPACES)
+    spatial_size: tuple[int, int] = checked_field(MISSING, check_size)  # (width, height)
+    hist_bins: int = integer(low=1)
+    orient: int = integer(low=1)
+    pix_per_cell: int = integer(low=1)
+    cell_per_block: int = integer(low=1)
+    hog_channel: int | str = choice(MISSING, (0, 1, 2, "ALL"))
+    spatial_feat: bool = checked_field(MISSING, _check_switch)
+    hist_feat: bool = checked_field(MISSING, _check_switch)
+    hog_feat: bool = checked_field(MISSING, _check_switch)
+    hist_range: tuple[float, float] | None = checked_field(MISSING, check_range)
+    transform_sqrt: bool = checked_field(MISSING, _check_switch)
+    spatial_order: Literal["interleaved", "channels"] = choice(MISSING, SPATIAL_ORDERS)
+
+    def __post_init__(self) -> None:
+        for switch, unused in _UNUSED.items():  # the lesson's code does not read them
+            if not _check_switch(getattr(self, switch), switch):
+                for name, value in unused.items():
+                    object.__setattr__(self, name, value)
+        super().__post_init__()
+        if not (self.spatial_feat or self.hist_feat or self.hog_feat):
+            raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; switch one on")
+
+    @classmethod
+    def of(cls, arguments: dict[str, Any]) -> Self:
+        """Pick the options from all arguments of a lesson function by name; check each set of them once."""
+        options = {field.name: arguments[field.name] for field in dataclasses.fields(cls)}
+        options["transform_sqrt"] = or_default(options["transform_sqrt"], "transform_sqrt")
+        key = f"{cls.__name__}({options})"
+        if key not in _checked:
+            if len(_checked) == _MAX_CHECKED:
+                _checked.clear()
+            _checked[key] = cls(**options)
+        return _checked[key]  # type: ignore[return-value]
+
+    @functools.cached_property
+    def blocks(self) -> int:
+        """HOG block positions along a side of a 64x64 window."""
+        return PATCH_SIZE // self.pix_per_cell - self.cell_per_block + 1
+
+    @functools.cached_property
+    def spatial_length(self) -> int:
+        """Length of the spatial bins."""
+        return 3 * self.spatial_size[0] * self.spatial_size[1] if self.spatial_feat else 0
+
+    @functools.cached_property
+    def length(self) -> int:
+        """Length of the feature vector of a 64x64 window."""
+        hog = (self.blocks * self.cell_per_block) ** 2 * self.orient * (3 if self.hog_channel == "ALL" else 1)
+        hist = 3 * self.hist_bins if self.hist_feat else 0
+        return self.spatial_length + hist + (hog if self.hog_feat else 0)
+
+    @functools.cached_property
+    def has_library_range(self) -> bool:
+        """Whether the histogram covers the range of the library's."""
+        return not self.hist_feat or self.hist_range == (0, 256)
+
+    @functools.cached_property
+    def params(self) -> FeatureParams | None:
+        """Parameters of the library for the same vector, but for `hist_range`; None if there are none."""
+        width, height = self.spatial_size
+        if self.spatial_feat and width != height:
+            return None
+        names = [field.name for field in dataclasses.fields(FeatureOptions) if field.name != "hist_range"]
+        try:
+            return FeatureParams(**{name: getattr(self, name) for name in names} | {"spatial_size": width})
+        except InvalidInputError:
+            return None
+
+    def compute(self, images: Images) -> list[NDArray[Any]]:
+        """Feature vectors of images in the lesson's order: float32 from the kernels, else float64."""
+        params = self.params if self.has_library_range else None
+        if params is None or not are_uint8_patches(images):
+            return [self._compute_one(image) for image in images]
+        return list(library.extract_features(np.asarray(images), params))
+
+    def _compute_one(self, image: Image) -> NDArray[np.float64]:
+        """Feature vector of one image by the lesson's steps."""
+        converted = convert_color(image, self.color_space)
+        parts: list[NDArray[Any]] = self.color_parts(converted)
+        if self.hog_feat:
+            parts.append(self.hog(converted).ravel())
+        return np.concatenate(parts).astype(np.float64)
+
+    def color_parts(self, converted: Image) -> list[NDArray[Any]]:
+        """Spatial bins and histogram of a converted image, where they are used."""
+        parts: list[NDArray[Any]] = []
+        if self.spatial_feat:
+            parts.append(bin_spatial(converted, self.spatial_size, order=self.spatial_order))
+        if self.hist_feat:
+            parts.append(color_hist(converted, self.hist_bins, self.hist_range))
+        return parts
+
+    def hog_source(self, converted: Image) -> Image:
+        """Select the channels of HOG of a converted image, ``(H, W, channels)``."""
+        return converted[..., slice(None) if self.hog_channel == "ALL" else [int(self.hog_channel)]]
+
+    def hog(self, converted: Image) -> NDArray[np.float32]:
+        """HOG of a converted image, see `hog_blocks`."""
+        sizes = (self.orient, self.pix_per_cell, self.cell_per_block)
+        return hog_blocks(self.hog_source(converted), *sizes, self.transform_sqrt)
+
+
+def are_uint8_patches(images: Images) -> bool:
+    """Whether images are 64x64 uint8 RGB, whose features the library's kernels compute."""
+    kind = (np.uint8, (PATCH_SIZE, PATCH_SIZE, 3))
+    return len(images) > 0 and all(
+        isinstance(image, np.ndarray) and (image.dtype, image.shape) == kind for image in images
+    )

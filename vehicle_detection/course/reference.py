@@ -17,8 +17,7 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
     PATCH_SIZE,
     FeatureParams,
-    bin_spatial,
-    color_hist,
+    color_parts,
     convert_color,
     hog_blocks,
     hog_source,
@@ -52,30 +51,20 @@ def shared_features(
     if params.hog_feat:
         source = hog_source(image, params)
         planes = [source[..., channel] for channel in range(params.hog_channels)]
-        hog = [_hog_blocks(plane, cell, params) for plane in planes]
+        hog = [
+            hog_blocks(plane, params.orient, cell, params.cell_per_block, params.transform_sqrt)
+            for plane in planes
+        ]
         coarse = [_coarse_blocks(plane, params) for plane in planes] if params.coarse_hog else []
     span = 2 * params.coarse_blocks
     features = np.empty((len(boxes), params.length))
     for row, (x1, y1, x2, y2) in enumerate(boxes):
-        parts: list[NDArray[Any]] = []
-        if params.spatial_feat:
-            patch = np.ascontiguousarray(spatial_image[y1:y2, x1:x2])
-            parts.append(bin_spatial(patch, params.spatial_size, order=params.spatial_order))
-        if params.hist_feat:
-            counts = color_hist(np.ascontiguousarray(hist_image[y1:y2, x1:x2]), params.hist_bins)
-            parts.append(np.sqrt(counts) if params.hist_sqrt else counts)
+        parts = color_parts(spatial_image[y1:y2, x1:x2], hist_image[y1:y2, x1:x2], params)
         top, left = y1 // cell, x1 // cell
         parts += [part[top : top + blocks, left : left + blocks].ravel() for part in hog]
         parts += [part[top : top + span : 2, left : left + span : 2].ravel() for part in coarse]
         features[row] = np.concatenate(parts)
     return features
-
-
-def _hog_blocks(channel: NDArray[np.uint8], cell: int, params: FeatureParams) -> NDArray[np.float64]:
-    """HOG of one channel with cells of `cell` pixels; see `hog_blocks`."""
-    return hog_blocks(
-        channel, params.orient, cell, params.cell_per_block, transform_sqrt=params.transform_sqrt
-    )
 
 
 def _coarse_blocks(channel: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.float64]:
@@ -84,11 +73,12 @@ def _coarse_blocks(channel: NDArray[np.uint8], params: FeatureParams) -> NDArray
     For odd cells the image is shifted by one cell. The new border is a reflection: the gradient between an
     image and its reflection is zero, as at the image's border.
     """
-    cell, block = params.pix_per_cell, params.cell_per_block
+    cell, block, orient = params.pix_per_cell, params.cell_per_block, params.orient
     rows, columns = (side // cell for side in channel.shape)
-    found = np.zeros((rows, columns, block, block, params.orient))
+    found = np.zeros((rows, columns, block, block, orient))
     for odd_y, odd_x in itertools.product((0, 1), repeat=2):
         shifted = cv2.copyMakeBorder(channel, odd_y * cell, 0, odd_x * cell, 0, cv2.BORDER_REFLECT_101)
-        blocks = _hog_blocks(np.asarray(shifted, np.uint8), 2 * cell, params)[odd_y:, odd_x:]
+        blocks = hog_blocks(np.asarray(shifted, np.uint8), orient, 2 * cell, block, params.transform_sqrt)
+        blocks = blocks[odd_y:, odd_x:]
         found[odd_y::2, odd_x::2][: len(blocks), : blocks.shape[1]] = blocks
     return found

@@ -21,21 +21,21 @@ from numpy.typing import NDArray
 from vehicle_detection._common import Workspace, choice, describe, integer, number
 from vehicle_detection.course.features import (
     FORMULAS,
+    FeatureOptions,
     Formula,
     Image,
     Size,
     SpatialOrder,
+    accept_cspace,
+    are_uint8_patches,
     bin_indices,
     bin_spatial,
     check_lesson_image,
     color_hist,
     convert_color,
     count_bins,
-    hog_blocks,
-    hog_maps,
 )
-from vehicle_detection.course.vectors import FeatureOptions, accept_cspace, are_uint8_patches
-from vehicle_detection.course.windows import Box, box_rows, corner_array, draw_corners
+from vehicle_detection.course.windows import BLUE, THICKNESS, Box, box_rows, corner_array
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE
 from vehicle_detection.search import BandFilters
@@ -85,7 +85,9 @@ def search_windows(
 ) -> list[Any]:
     """Classify each window of an image, resized to 64x64 pixels.
 
-    Returns the windows, in their order, for which the classifier predicts 1.
+    Returns the windows, in their order, for which the classifier predicts 1. The options are those of
+    `extract_features` with which it was trained; the lesson's code ignores `hist_range` here. A warning says
+    if the scaler was fitted on values 0-255 and the image has values 0-1, or the other way round.
 
     Parameters
     ----------
@@ -98,17 +100,6 @@ def search_windows(
     clf, scaler
         A fitted classifier with ``predict`` and a fitted scaler with ``transform``, of any kind; None for a
         classifier of features that are not scaled.
-    hist_range
-        As in `extract_features`; the lesson's code ignores it here.
-    color_space, spatial_size, hist_bins, orient, pix_per_cell, cell_per_block, hog_channel
-        As in `extract_features`, of the features that the classifier was trained on.
-    spatial_feat, hist_feat, hog_feat, transform_sqrt, spatial_order
-        As in `extract_features`.
-
-    Warns
-    -----
-    UserWarning
-        If the scaler was fitted on values 0-255 and the image has values 0-1, or the other way round.
 
     Examples
     --------
@@ -191,7 +182,8 @@ def find_cars(
     """
     boxes = find_car_windows(**locals())  # all arguments
     drawn: Image = np.array(img, order="C")
-    draw_corners(drawn, np.array(boxes, int).reshape(-1, 4))
+    for corner, opposite in boxes:
+        cv2.rectangle(drawn, corner, opposite, BLUE, THICKNESS)
     return drawn
 
 
@@ -228,42 +220,31 @@ def find_car_windows(
 
     Parameters
     ----------
-    img
-        ``(H, W, 3)`` RGB.
-    ystart, ystop
-        Rows to search.
+    img, ystart, ystop
+        ``(H, W, 3)`` RGB, and the rows to search.
     scale
         Side of a window divided by 64 pixels: the band is shrunk by this factor.
     svc, X_scaler
-        A fitted classifier with ``predict`` and a fitted scaler with ``transform``, of any kind; None for a
-        classifier of features that are not scaled.
+        As `clf` and `scaler` of `search_windows`.
     orient, pix_per_cell, cell_per_block, spatial_size, hist_bins
         As in `extract_features`, of the features that the classifier was trained on.
     color_space, hog_channel, spatial_feat, hist_feat, hog_feat, hist_range, transform_sqrt, spatial_order
-        As in `extract_features`. The quiz comes with functions that order the bins by channel and take the
-        range of each channel: pass ``spatial_order="channels", hist_range=None`` for a model trained with
-        them.
+        As in `extract_features`. Pass ``spatial_order="channels", hist_range=None`` for a model trained with
+        the functions of the quiz, which order the bins by channel and take the range of each channel.
     cells_per_step
         Step between windows, in cells.
     divide_by
         Number by which the values are divided first. The quiz divides by 255, for a model trained on PNG
-        files, which ``mpimg.imread`` reads as float 0-1. Pass 1 for a model trained on uint8 images; most
-        published systems remove the division then. A uint8 image is searched by the library's fast search. A
-        float image with values 0-1 is never divided.
+        files, which ``mpimg.imread`` reads as float 0-1. Pass 1 for a model trained on uint8 images. A float
+        image with values 0-1 is never divided.
     resize
         ``"after conversion"``: the quiz converts the colors first and then shrinks the band.
-        ``"before conversion"``: shrink first, as a window-by-window search (`search_windows`) and the main
-        API do. Scores of the two differ by up to 1.7 at scales other than 1.
+        ``"before conversion"``: shrink first, as `search_windows` and the main API do. Scores of the two
+        differ by up to 1.7 at scales other than 1.
     formula
         Number of steps along an axis; the course has published both. ``"old"``:
         ``(blocks - blocks per window) // cells_per_step``, which leaves out the last position; ``"new"`` adds
-        one. `set_lesson_defaults` does not change this default: the two versions of `slide_window` are
-        independent of these.
-
-    Warns
-    -----
-    UserWarning
-        If the scaler was fitted on values 0-255 and the searched values are 0-1, or the other way round.
+        one. `set_lesson_defaults` does not change this default.
 
     Examples
     --------
@@ -351,8 +332,7 @@ def _search_band(converted: Image, estimators: _Estimators, options: _SearchOpti
     if options.hog_feat:
         # A view: (channels, rows, columns, block, block, orient, blocks, blocks), windows at every cell.
         window = (options.blocks, options.blocks)
-        blocks = hog_blocks(*options.hog_arguments(converted))
-        view = np.lib.stride_tricks.sliding_window_view(blocks, window, axis=(1, 2))
+        view = np.lib.stride_tricks.sliding_window_view(options.hog(converted), window, axis=(1, 2))
         hog = view.transpose(1, 2, 0, 6, 7, 3, 4, 5)[::cells_per_step, ::cells_per_step]
     indices = None
     if options.hist_feat and options.hist_range is not None:
@@ -394,19 +374,13 @@ def _fast_scores(
     converted: Image, options: FeatureOptions, filters: BandFilters, workspace: Workspace
 ) -> NDArray[np.float32]:
     """Scores of the windows at every cell by the library's filters."""
-    if converted.dtype == np.uint8 and options.has_library_range:
-        return filters.score_converted(converted, {options.color_space: converted}, workspace)
-    hist, tables = converted, None
-    if options.hist_feat:
-        assert options.hist_range is not None
-        hist = bin_indices(converted, options.hist_bins, options.hist_range)
+    hist, tables, limits = converted, filters.tables, options.hist_range
+    if options.hist_feat and limits and not (converted.dtype == np.uint8 and options.has_library_range):
+        hist = bin_indices(converted, options.hist_bins, limits)
         # The last bin, of values out of range, has no weight.
         tables = np.pad(filters.weights_by_bin, ((0, 0), (0, 0), (0, 1)))
-    maps = []
-    if options.hog_feat:
-        hog = hog_maps(*options.hog_arguments(converted))
-        maps = [hog.reshape(-1, *hog.shape[4:])]
-    return filters.score_maps(maps, converted, hist, tables, workspace)
+    source = options.hog_source(converted) if options.hog_feat else None
+    return filters.score_images(source, converted, hist, tables, workspace)
 
 
 def _classify_patches(patches: list[Image], estimators: _Estimators) -> NDArray[np.bool_]:
@@ -457,12 +431,8 @@ def _check_estimators(clf: Any, scaler: Any, options: FeatureOptions, image: Ima
     if known and clf is not None and "predict" not in vars(clf):
         state = [type(clf), type(scaler)]
         state += [getattr(each, name, None) for each in (clf, scaler) for name in _MODEL_STATE]
-    last = _last
-    if last is None or state is None or last.state is None or last.options != options:
-        found = None
-    else:
-        found = last if all(map(_equal, last.state, state)) else None
-    if found is None:
+    found = _last
+    if found is None or found.options != options or not _is_same_state(found.state, state):
         found = _last = _read_estimators(clf, scaler, options, copy.deepcopy(state))
     elif found.clf is not clf or found.scaler is not scaler:
         found = dataclasses.replace(found, clf=clf, scaler=scaler)
@@ -470,17 +440,16 @@ def _check_estimators(clf: Any, scaler: Any, options: FeatureOptions, image: Ima
     return found
 
 
-def _equal(first: Any, second: Any) -> bool:
-    return np.array_equal(first, second) if isinstance(first, np.ndarray) else bool(first == second)
+def _is_same_state(first: list[Any] | None, second: list[Any] | None) -> bool:
+    return first is not None and second is not None and all(map(np.array_equal, first, second))
 
 
 def _read_estimators(clf: Any, scaler: Any, options: FeatureOptions, state: list[Any] | None) -> _Estimators:
     from sklearn.exceptions import NotFittedError
     from sklearn.utils.validation import check_is_fitted
 
-    for estimator, name, method in ((clf, "classifier", "predict"), (scaler, "scaler", "transform")):
-        if scaler is None and name == "scaler":
-            continue
+    given = [(clf, "classifier", "predict"), (scaler, "scaler", "transform")]
+    for estimator, name, method in given[: 1 if scaler is None else 2]:
         if not hasattr(estimator, method):
             raise InvalidInputError(f"the {name} must have a method {method}; got {describe(estimator)}")
         if type(estimator).__module__.startswith("sklearn."):
@@ -552,9 +521,7 @@ def _has_spread_histograms(scaler: Any, options: FeatureOptions) -> bool:
     channels = list(UNIT_CHANNELS.get(options.color_space, ()))
     if means is None or not (options.hist_feat and options.hist_range and channels):
         return False
-    width, height = options.spatial_size
-    start = 3 * width * height if options.spatial_feat else 0
-    counts = means[start : start + 3 * options.hist_bins].reshape(3, -1)[channels]
+    counts = means[options.spatial_length :][: 3 * options.hist_bins].reshape(3, -1)[channels]
     lows = np.linspace(*options.hist_range, options.hist_bins, endpoint=False)
     return bool(counts[:, lows > _MAX_UNIT].sum() > _MIN_SPREAD * counts.sum())
 
@@ -566,9 +533,7 @@ def _was_fitted_on_unit_range(scaler: Any, options: FeatureOptions) -> bool | No
         return None
     if options.params is not None:
         scales = np.ones_like(means) if scales is None else scales
-        found = has_unit_range(means, scales, options.params)
-        return found or (False if options.spatial_feat else None)
+        return has_unit_range(means, scales, options.params) or (False if options.spatial_feat else None)
     if not options.spatial_feat or len(UNIT_CHANNELS.get(options.color_space, ())) < 3:
         return None
-    width, height = options.spatial_size
-    return bool(np.max(means[: 3 * width * height]) <= 2)
+    return bool(np.max(means[: options.spatial_length]) <= 2)

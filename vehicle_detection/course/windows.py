@@ -16,8 +16,8 @@ from vehicle_detection.errors import InvalidInputError
 
 Box = tuple[tuple[int, int], tuple[int, int]]
 
-_BLUE = (0, 0, 255)
-_THICKNESS = 6
+BLUE = (0, 0, 255)
+THICKNESS = 6
 
 
 def slide_window(
@@ -39,10 +39,8 @@ def slide_window(
         Only its height and width are used.
     x_start_stop, y_start_stop
         Pixel range of the region, whole numbers; None means the image's border. Lists are not changed.
-    xy_window
-        Width and height of a window, whole numbers.
-    xy_overlap
-        Horizontal and vertical overlap of neighboring windows as a fraction of their size.
+    xy_window, xy_overlap
+        Width and height of a window, whole numbers, and overlap of neighboring windows as fractions of these.
     formula
         Number of windows along an axis; the course has published both. ``"old"``: ``int(span / step) - 1``;
         with overlaps above 0.5 the last windows extend beyond the region, and below 0.5 some that fit are
@@ -146,16 +144,12 @@ def corner_array(boxes: Any, name: str) -> NDArray[np.int64]:
 
 
 def add_heat(heatmap: NDArray[Any], bbox_list: Any) -> NDArray[Any]:
-    """Add 1 to the pixels of each box, in place: `add_heat` of the main API for corner pairs.
-
-    Returns the same array, `heatmap`.
+    """Add 1 to the pixels of each box, in place, and return the same array.
 
     Parameters
     ----------
-    heatmap
-        ``(H, W)``; changed.
-    bbox_list
-        Corner pairs, an ``(N, 4)`` array, or `Detections`; parts outside the map are cut off.
+    heatmap, bbox_list
+        ``(H, W)``, changed; corner pairs, an ``(N, 4)`` array, or `Detections`, cut off at the map's border.
 
     Examples
     --------
@@ -172,21 +166,15 @@ def add_heat(heatmap: NDArray[Any], bbox_list: Any) -> NDArray[Any]:
 apply_threshold = library.apply_threshold
 
 
-def draw_boxes(img: Image, bboxes: Any, color: Sequence[float] = _BLUE, thick: int = _THICKNESS) -> Image:
+def draw_boxes(img: Image, bboxes: Any, color: Sequence[float] = BLUE, thick: int = THICKNESS) -> Image:
     """Draw boxes on a copy of an image; the lines are centered on the box's edges, as by ``cv2.rectangle``.
-
-    Returns a new image of the same dtype.
 
     Parameters
     ----------
-    img
-        ``(H, W, 3)``, uint8 or float.
-    bboxes
-        Corner pairs, an ``(N, 4)`` array, or `Detections`.
-    color
-        RGB, 0-255 each.
-    thick
-        Width of the lines in pixels; -1 fills the boxes.
+    img, bboxes
+        ``(H, W, 3)``, uint8 or float; corner pairs, an ``(N, 4)`` array, or `Detections`.
+    color, thick
+        RGB, 0-255 each, and width of the lines in pixels; -1 fills the boxes.
 
     Examples
     --------
@@ -206,22 +194,16 @@ def draw_boxes(img: Image, bboxes: Any, color: Sequence[float] = _BLUE, thick: i
 
 
 def draw_labeled_bboxes(img: Image, labels: Any) -> Image:
-    """Draw the bounding box of each labeled region on the image itself.
+    """Draw the bounding box of each labeled region on the image itself, and return it.
 
-    Returns the same array, `img`, with blue rectangles, 6 pixels thick. Their corners are a region's first
-    and last pixels, so they are one pixel smaller than the half-open boxes of the main API.
+    The corners of the blue rectangles, 6 pixels thick, are a region's first and last pixels, so they are one
+    pixel smaller than the half-open boxes of the main API.
 
     Parameters
     ----------
-    img
-        ``(H, W, 3)``, uint8 or float; changed.
-    labels
-        The label array ``(H, W)`` and the number of regions, as ``scipy.ndimage.label`` returns them.
-
-    Raises
-    ------
-    InvalidInputError
-        If the image is read-only or its rows are not contiguous, or `labels` is not such a pair for its size.
+    img, labels
+        ``(H, W, 3)``, uint8 or float, writable, with contiguous rows; the label array ``(H, W)`` and the
+        number of regions, as ``scipy.ndimage.label`` returns them.
 
     Examples
     --------
@@ -251,7 +233,7 @@ def draw_labeled_bboxes(img: Image, labels: Any) -> Image:
 
 
 def draw_corners(
-    image: Image, corners: NDArray[np.int64], color: Sequence[float] = _BLUE, thick: int = _THICKNESS
+    image: Image, corners: NDArray[np.int64], color: Sequence[float] = BLUE, thick: int = THICKNESS
 ) -> None:
     """Draw boxes on the image itself."""
     for x1, y1, x2, y2 in corners.tolist():
