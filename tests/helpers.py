@@ -42,7 +42,7 @@ def start_interruptible(*command, **options):
             signal.signal(number, handler)
 
 
-def random_template(params, seed=0, *, bias=0.0):
+def _random_template(params, seed, bias):
     """A template whose scores are of the order of one, on features of the usual sizes."""
     rng = np.random.default_rng(seed)
     hist = (params.hist_length, 8, 8) if params.hist_sqrt else (params.hist_length, 128, 100)
@@ -56,7 +56,7 @@ def random_template(params, seed=0, *, bias=0.0):
 def random_classifier(params, seed=0, *, templates=1, bias=0.0):
     """A classifier that was never trained: its scores are as good as any for comparing two searches."""
     return VehicleClassifier(
-        params, tuple(random_template(params, seed + index, bias=bias) for index in range(templates))
+        params, tuple(_random_template(params, seed + index, bias) for index in range(templates))
     )
 
 

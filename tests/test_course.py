@@ -446,15 +446,14 @@ def test_a_changed_model_is_noticed(models):
     assert search() == []
 
 
-def test_cells_that_do_not_divide_a_window():
-    options = {"color_space": "YCrCb", "spatial_size": (16, 16), "hist_bins": 16, "pix_per_cell": 12}
-    for hist_range in ((0, 256), None):
-        features = reference.extract_features(PATCHES, **options, hist_range=hist_range)
-        model = trained(features)
-        arguments = (FRAMES["uint8"], 60, 200, 1, *model, 9, 12, 2, (16, 16), 16)
-        keywords = {"hog_channel": 0, "formula": "new", "divide_by": 1, "hist_range": hist_range}
-        found, expected = (module.find_car_windows(*arguments, **keywords) for module in (lesson, reference))
-        assert found == expected
+@pytest.mark.parametrize("hist_range", [(0, 256), None])
+def test_cells_that_do_not_divide_a_window(hist_range):
+    options = {"spatial_size": (16, 16), "hist_bins": 16, "pix_per_cell": 12, "hist_range": hist_range}
+    model = trained(reference.extract_features(PATCHES, "YCrCb", **options))
+    arguments = (FRAMES["uint8"], 60, 200, 1, *model, 9, 12, 2, (16, 16), 16)
+    keywords = {"hog_channel": 0, "formula": "new", "divide_by": 1, "hist_range": hist_range}
+    found, expected = (module.find_car_windows(*arguments, **keywords) for module in (lesson, reference))
+    assert found == expected
 
 
 def test_a_float_image_from_0_to_1_is_not_divided(models):
@@ -485,10 +484,8 @@ UNIT_SPACES = ["RGB", "YUV", "YCrCb", "HSV", "HLS"]
 def test_histograms_of_another_range_warn(color_space, spatial_feat):
     """With ``hist_range=(0, 256)``, a 0-1 image fills the first bins only."""
     options = {"color_space": color_space, "spatial_size": (8, 8), "spatial_feat": spatial_feat}
-    for images, hist_range in (
-        (PATCHES / np.float32(255), None),  # of the HOG sub-sampling quiz
-        (PATCHES, (0, 256)),
-    ):
+    # None is the range of the HOG sub-sampling quiz.
+    for images, hist_range in ((PATCHES / np.float32(255), None), (PATCHES, (0, 256))):
         model = trained(np.array(lesson.extract_features(images, **options, hist_range=hist_range)))
         with pytest.warns(UserWarning, match="scaler was fitted on") as caught:
             lesson.search_windows(FRAMES["0-1"], PAIRS, *model, **options)
@@ -662,7 +659,6 @@ def test_labeled_boxes_are_drawn_on_a_part_of_an_image():
         lesson.draw_labeled_bboxes(part, label(heat))
 
 
-# As in published systems: `d` holds an image, patches, files and a model.
 # As in published systems, where those of `test_course_systems` differ; with the shape of what is returned.
 CALL_FORMS = [
     ("get_hog_features(d.gray, 9, 8, 2, False, True)", (1764,)),

@@ -10,11 +10,7 @@ from hypothesis import strategies as st
 from tests.feature_cases import BLANK, PATCHES
 from tests.helpers import rendered_patches
 from vehicle_detection._kernels import features as kernels
-from vehicle_detection._kernels.features import (
-    bin_of_value,
-    degree_bounds,
-    orientation_cotangents,
-)
+from vehicle_detection._kernels.features import bin_of_value, degree_bounds, orientation_cotangents
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
     COLOR_SPACES,

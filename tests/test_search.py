@@ -13,13 +13,7 @@ from tests.helpers import random_classifier
 from vehicle_detection.course.reference import score_windows
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import COLOR_SPACES, FeatureParams
-from vehicle_detection.search import (
-    PixelBand,
-    SearchBand,
-    SearchParams,
-    resize_band,
-    resized_shape,
-)
+from vehicle_detection.search import PixelBand, SearchBand, SearchParams, resize_band, resized_shape
 from vehicle_detection.svm import VehicleClassifier
 from vehicle_detection.training import to_pipeline
 from vehicle_detection.windows import find_cars, search_windows, slide_window

@@ -461,11 +461,7 @@ def color_parts(
 
 
 def extract_features(
-    source: Any,
-    params: FeatureParams | None = None,
-    *,
-    jobs: int | None = None,
-    progress: bool = False,
+    source: Any, params: FeatureParams | None = None, *, jobs: int | None = None, progress: bool = False
 ) -> NDArray[np.float32]:
     """Feature vectors of many patches, equal to those of `single_img_features`.
 

@@ -66,8 +66,7 @@ class HeatParams(Checked):
     frames
         Number of frames over which the heat is averaged.
     threshold
-        Highest heat that is removed. None: chosen for the model and the density of its search. More
-        windows cover a vehicle in a denser search, so a threshold fits one density only.
+        Highest heat that is removed; fits one density of windows only. None: chosen for the search.
     peak_fraction
         A region is reduced to the part around its peak that has at least this fraction of the peak's heat,
         in [0, 1); 0 keeps whole regions, as in the course.
@@ -201,9 +200,7 @@ def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, peak_fraction:
     heatmap, threshold
         ``(H, W)`` heat; heat at or below `threshold` belongs to no region.
     peak_fraction
-        0 gives the box of the whole region, as in the course. Otherwise the box of the part around the
-        region's peak that has at least this fraction of the peak's heat, in [0, 1): windows extend beyond
-        the vehicle, where the heat is lower.
+        As in `HeatParams`: windows extend beyond the vehicle, where the heat is lower.
 
     Examples
     --------

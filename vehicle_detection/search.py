@@ -53,17 +53,13 @@ from vehicle_detection.features import PATCH_SIZE, FeatureParams, convert_color,
 REFERENCE_WIDTH = 1280
 """Search windows are given in pixels of a frame whose longer side has this length."""
 
-# Windows of sides that differ by at most this factor fire on the same vehicle.
-_SIMILAR_SIDES = 1.5
-# The fast search steps by one cell, an eighth of a window, or more.
-_MIN_STEP = 1 / 8
+_SIMILAR_SIDES = 1.5  # windows of sides that differ by at most this factor fire on the same vehicle
+_MIN_STEP = 1 / 8  # the fast search steps by one cell, an eighth of a window, or more
 
 Pair = tuple[float, float]
 
 
 def _pair(*, low: float, high: float) -> Callable[[Any, str], Pair]:
-    """Return a check of two numbers."""
-
     def check(value: Any, name: str) -> Pair:
         if not isinstance(value, tuple) or len(value) != 2:
             raise InvalidInputError(f"{name} must be a pair of numbers, got {describe(value)}")
@@ -272,10 +268,7 @@ class SearchResult:
 
 
 class FrameSearch(Closing, ABC):
-    """What ``model.open_search()`` returns for every kind of model: threads and memory kept between frames.
-
-    Searches are thread-safe context managers.
-    """
+    """What ``model.open_search()`` returns: a thread-safe context manager that keeps threads and memory."""
 
     params_type: ClassVar[type[Any]]
 

@@ -174,11 +174,7 @@ class VehicleClassifier:
 
     @classmethod
     def from_pipeline(
-        cls,
-        pipeline: Any,
-        params: FeatureParams | None = None,
-        *,
-        metadata: Mapping[str, Any] | None = None,
+        cls, pipeline: Any, params: FeatureParams | None = None, *, metadata: Mapping[str, Any] | None = None
     ) -> VehicleClassifier:
         """Convert fitted scikit-learn estimators, scalers and a linear classifier: the scores are equal.
 
@@ -245,10 +241,7 @@ class VehicleClassifier:
         return BandFilters(self.params, [template.fold() for template in self.templates])
 
     def open_search(self, jobs: int | None = None) -> BandSearch:
-        """Open a search of frames with this model: a thread-safe context manager, with `SearchParams`.
-
-        The result does not depend on the number of threads, `jobs`.
-        """
+        """Open a search of frames in `jobs` threads: a thread-safe context manager, with `SearchParams`."""
         return BandSearch(self.filters, jobs)
 
     def __repr__(self) -> str:

@@ -10,13 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    check_integer,
-    check_number,
-    check_sequence,
-    check_type,
-    describe,
-)
+from vehicle_detection._common import check_integer, check_number, check_sequence, check_type, describe
 from vehicle_detection.camera import Camera
 from vehicle_detection.course.features import or_default
 from vehicle_detection.course.search import find_car_windows

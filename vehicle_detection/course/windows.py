@@ -106,26 +106,14 @@ def box_rows(boxes: Any) -> Any:
     return getattr(boxes, "xyxy", boxes)
 
 
-def _contains_image(rows: Any) -> bool:
-    """Whether boxes are an RGB image, or a list with images or rows of one, as by ``boxes.extend(image)``."""
-    items = rows if isinstance(rows, list) or (isinstance(rows, np.ndarray) and rows.ndim) else ()
-    return any(isinstance(item, np.ndarray) and item.ndim >= 2 and item.shape[-1] == 3 for item in items)
-
-
-def _first_corners(boxes: list[Any]) -> NDArray[Any]:
-    """Return the first two items of each box, its corners; an array of no boxes if there are none."""
-    try:
-        return np.array([(box[0], box[1]) for box in boxes])
-    except (TypeError, IndexError, KeyError, ValueError):
-        return np.array(None)
-
-
 def corner_array(boxes: Any, name: str) -> NDArray[np.int64]:
     """Return boxes as ``(N, 4)`` whole pixels, from corner pairs, an array or detections."""
     rows = box_rows(boxes)
     if isinstance(rows, Iterable) and not isinstance(rows, (str, np.ndarray)):
         rows = list(rows)
-    if _contains_image(rows):
+    items = rows if isinstance(rows, list) or getattr(rows, "ndim", 0) else ()
+    # An RGB image, or a list with images or rows of one, as by boxes.extend(image).
+    if any(isinstance(item, np.ndarray) and item.ndim >= 2 and item.shape[-1] == 3 for item in items):
         raise InvalidInputError(
             f"{name} must be a list of corner pairs ((x1, y1), (x2, y2)), got an image or rows of one; "
             "find_cars returns a picture, find_car_windows returns the boxes"
@@ -133,7 +121,10 @@ def corner_array(boxes: Any, name: str) -> NDArray[np.int64]:
     try:
         array = np.asarray(rows)
     except ValueError:  # rows of different lengths, such as boxes with scores
-        array = _first_corners(rows)
+        try:
+            array = np.array([(box[0], box[1]) for box in rows])
+        except (TypeError, IndexError, KeyError, ValueError):
+            array = np.array(None)
     if array.size == 0:
         return np.empty((0, 4), np.int64)
     if array.shape[1:] not in ((4,), (2, 2)) or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
