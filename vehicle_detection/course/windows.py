@@ -111,7 +111,7 @@ def corner_array(boxes: Any, name: str) -> NDArray[np.int64]:
     rows = box_rows(boxes)
     if isinstance(rows, Iterable) and not isinstance(rows, (str, np.ndarray)):
         rows = list(rows)
-    items = rows if isinstance(rows, list) or getattr(rows, "ndim", 0) else ()
+    items = rows if isinstance(rows, list) or (isinstance(rows, np.ndarray) and rows.ndim) else ()
     # An RGB image, or a list with images or rows of one, as by boxes.extend(image).
     if any(isinstance(item, np.ndarray) and item.ndim >= 2 and item.shape[-1] == 3 for item in items):
         raise InvalidInputError(
