@@ -134,14 +134,18 @@ class _TimedModule:
 
 
 _KERNELS = {
-    "hog_cells": "HOG cells",
     "normalize_blocks": "blocks",
     "histogram_cells": "histogram",
     "add_root_histograms": "histogram",
     "spatial_cells": "spatial bins",
 }
 _MODULES = {"cv2": {"resize": "spatial bins"}}
-_FUNCTIONS = {"resize_band": "resize", "convert_color": "color", "_hits": "hits"}
+_FUNCTIONS = {
+    "resize_band": "resize",
+    "convert_color": "color",
+    "hog_cells": "HOG cells",
+    "_hits": "hits",
+}
 
 
 @contextlib.contextmanager

@@ -277,27 +277,6 @@ def hog_source(
     return np.ascontiguousarray(converted[..., int(params.hog_channel), None])
 
 
-def hog_cells(
-    image: NDArray[Any], orient: int, cell: int, transform_sqrt: bool, cells: NDArray[np.float32]
-) -> None:
-    """Fill ``(channels, orient, rows, columns)`` float32 with the orientation histograms of an image's cells.
-
-    Equals the first stage of scikit-image's HOG; `image` is ``(H, W, channels)``, uint8 or float.
-    """
-    channels = image.shape[2]
-    if transform_sqrt:
-        if image.dtype != np.uint8 and image.min() < 0:
-            raise InvalidInputError(
-                "transform_sqrt must be False for negative values, which float LUV and LAB images have; "
-                "convert a uint8 image, or switch it off"
-            )
-        gradients = kernels.sqrt_gradients(image)
-        kernels.sum_orientations(*gradients, kernels.degree_bounds(orient), channels, cell, cells)
-    else:
-        flat = np.ascontiguousarray(image).reshape(len(image), -1)
-        kernels.hog_cells(flat, channels, cell, kernels.orientation_cotangents(orient), cells)
-
-
 def hog_blocks(
     img: NDArray[np.uint8], orient: int, pix_per_cell: int, cell_per_block: int, transform_sqrt: bool = False
 ) -> NDArray[np.float64]:

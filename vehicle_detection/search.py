@@ -48,7 +48,7 @@ from vehicle_detection._kernels import Filter
 from vehicle_detection._kernels import features as kernels
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import PATCH_SIZE, FeatureParams, convert_color, hog_cells, hog_source
+from vehicle_detection.features import PATCH_SIZE, FeatureParams, convert_color, hog_source
 
 REFERENCE_WIDTH = 1280
 """Search windows are given in pixels of a frame whose longer side has this length."""
@@ -391,6 +391,27 @@ def _hits(
     boxes[:, 2] = boxes[:, 0] + scale_x * PATCH_SIZE
     boxes[:, 3] = boxes[:, 1] + scale_y * PATCH_SIZE
     return boxes, grid[rows, columns].astype(np.float64)
+
+
+def hog_cells(
+    image: NDArray[Any], orient: int, cell: int, transform_sqrt: bool, cells: NDArray[np.float32]
+) -> None:
+    """Fill ``(channels, orient, rows, columns)`` float32 with the orientation histograms of an image's cells.
+
+    Equals the first stage of scikit-image's HOG; `image` is ``(H, W, channels)``, uint8 or float.
+    """
+    channels = image.shape[2]
+    if transform_sqrt:
+        if image.dtype != np.uint8 and image.min() < 0:
+            raise InvalidInputError(
+                "transform_sqrt must be False for negative values, which float LUV and LAB images have; "
+                "convert a uint8 image, or switch it off"
+            )
+        gradients = kernels.sqrt_gradients(image)
+        kernels.sum_orientations(*gradients, kernels.degree_bounds(orient), channels, cell, cells)
+    else:
+        flat = np.ascontiguousarray(image).reshape(len(image), -1)
+        kernels.hog_cells(flat, channels, cell, kernels.orientation_cotangents(orient), cells)
 
 
 class BandFilters:

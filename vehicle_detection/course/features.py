@@ -32,6 +32,7 @@ from vehicle_detection._kernels import features as kernels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import COLOR_SPACES, PATCH_SIZE, SPATIAL_ORDERS, FeatureParams
 from vehicle_detection.images import read_image
+from vehicle_detection.search import hog_cells
 
 Image = NDArray[Any]
 Images = list[Image] | NDArray[Any]
@@ -44,8 +45,7 @@ Result = TypeVar("Result")
 FORMULAS = ("old", "new")
 # OpenCV's names of the color spaces by their name in upper case.
 _OPENCV_SPACES = {space.upper(): space for space in (*COLOR_SPACES, "BGR", "GRAY")}
-# Number of images that are read and processed at a time.
-_CHUNK = 4096
+_CHUNK = 4096  # number of images that are read and processed at a time
 # Values of the options of a group of features that is switched off.
 _UNUSED: dict[str, dict[str, Any]] = {
     "spatial_feat": {"spatial_size": (32, 32)},
@@ -53,8 +53,7 @@ _UNUSED: dict[str, dict[str, Any]] = {
     "hog_feat": {"orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "hog_channel": 0},
 }
 _defaults: dict[str, Any] = {"transform_sqrt": False, "formula": "old"}
-# The options of earlier calls.
-_checked: dict[str, FeatureOptions] = {}
+_checked: dict[str, FeatureOptions] = {}  # the options of earlier calls
 _MAX_CHECKED = 64
 
 
@@ -312,7 +311,7 @@ def hog_blocks(
             f"img must be at least one block large ({side}x{side} pixels); got {width}x{height}"
         )
     cells = np.empty((channels, orient, height // cell, width // cell), np.float32)
-    library.hog_cells(image, orient, cell, transform_sqrt, cells)
+    hog_cells(image, orient, cell, transform_sqrt, cells)
     blocks = np.empty((channels, block, block, *cells.shape[1:]), np.float32)
     kernels.normalize_blocks(cells, block, 1, blocks)
     rows, columns = (count - block + 1 for count in cells.shape[2:])
