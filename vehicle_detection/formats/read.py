@@ -26,6 +26,7 @@ from vehicle_detection._common import (
     check_sequence,
     check_shape,
     describe,
+    import_pyarrow,
     read_regular_file,
     shorten,
 )
@@ -156,13 +157,7 @@ def _read_json_lines(source: Path, classes: Collection[str] | None) -> Found:
 
 
 def _read_parquet(source: Path, classes: Collection[str] | None) -> Found:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise InvalidInputError(
-            "a .parquet file needs pyarrow; pip install pyarrow, or convert it to .csv"
-        ) from None
+    pyarrow = import_pyarrow()
     check_regular_file(source, str(source), Limit.TEXT_BYTES, error=DatasetError)
     try:
         table = pyarrow.parquet.read_table(source)
@@ -182,7 +177,7 @@ def _read_kitti(source: Path, classes: Collection[str] | None) -> Found:
             record = _kitti_record(where, line.split(), classes)
             if record is not None:
                 # An ignored box without a track would be a region.
-                track = len(rows) if record["ignore"] and record["region"] is False else NO_TRACK
+                track = len(rows) if record["ignore"] and "occluded" in record else NO_TRACK
                 rows.append((where, {"frame": file.stem, "track_id": track, **record}))
     return _found(rows, [file.stem for file in files])
 
@@ -195,16 +190,18 @@ def _no_text_files(folder: Path, expected: str) -> DatasetError:
 
 
 def _kitti_record(where: str, words: list[str], classes: Collection[str] | None) -> Record | None:
-    """One KITTI object; None for a person."""
+    """One KITTI object; None for a person. One without `occluded` is a region."""
     if len(words) not in (15, 16):
         raise DatasetError(f"{where}: a KITTI object has 15 values (16 with a score), found {len(words)}")
     name = words[0].lower()
     corners = [parse_number(word, "corner of the box", where) for word in words[4:8]]
     score = words[15] if len(words) == 16 else None
-    record = {**dict(zip(CORNERS, corners)), "score": score, "ignore": True, "region": name == "dontcare"}
+    record = {**dict(zip(CORNERS, corners)), "score": score, "ignore": True}
+    if name == "dontcare":
+        return record
     wanted = name in (VEHICLE_CLASSES if classes is None else classes)
-    if record["region"] or (not wanted and name in PERSON_CLASSES):
-        return record if record["region"] else None
+    if not wanted and name in PERSON_CLASSES:
+        return None
     # Results hold -1 for unknown values; an occlusion of 3 is KITTI's "unknown".
     truncated = min(max(parse_number(words[1], "truncated", where), 0.0), 1.0)
     occluded = min(max(int(parse_number(words[2], "occluded", where)), 0), _HIDDEN)
