@@ -36,10 +36,8 @@ from vehicle_detection.training import (
     fit_log_odds,
     load_content,
     load_training_frames,
-    load_weights,
     package_versions,
     rendered_source,
-    save_weights,
     score_logits,
     select_frames,
     set_metadata,
@@ -162,8 +160,21 @@ def _train(options: argparse.Namespace) -> None:
     with atomic_write(options.output, "--output") as part:
         part.write_bytes(content)
     if options.save_weights is not None:
-        save_weights(network, options.save_weights)
+        from safetensors.torch import save_model
+
+        with atomic_write(options.save_weights, "--save-weights") as part:
+            save_model(network, str(part))
     _write_reports(options, load_content(content), folds, sources)
+
+
+def _load_weights(path: Path) -> Network:
+    from safetensors.torch import load_model
+
+    from vehicle_detection.training.architecture import Network
+
+    network = Network()
+    load_model(network, path)
+    return network.eval()
 
 
 def _network(
@@ -171,12 +182,12 @@ def _network(
 ) -> Network:
     """Read a network, or train it; an interrupted training is continued."""
     if weights is not None:
-        return load_weights(weights)
+        return _load_weights(weights)
     checkpoint = options.output.with_name(f"{options.output.name}.{name}.checkpoint")
     network = train_network(
         frames,
         NetworkTraining(steps=options.steps, random_state=options.seed),
-        initial=None if options.init is None else load_weights(options.init),
+        initial=None if options.init is None else _load_weights(options.init),
         device=options.device,
         jobs=options.jobs,
         checkpoint=checkpoint,

@@ -490,10 +490,7 @@ def _parse_frames(cells: Sequence[Any], places: Sequence[str]) -> list[FrameKey]
 
 
 def _vehicle_rows(
-    cells: Mapping[str, Sequence[Any]],
-    source: object,
-    classes: Collection[str] | None,
-    predicted: bool,
+    cells: Mapping[str, Sequence[Any]], source: object, classes: Collection[str] | None, predicted: bool
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Mark the rows to keep, and the labels of lookalikes among them, by the columns of classes."""
     count = len(cells["frame"])

@@ -48,11 +48,7 @@ def test_a_random_split_depends_on_the_seed_only():
 @pytest.mark.parametrize(
     ("labels", "options", "message"),
     [
-        (
-            [1, 1, 1, 0],
-            {},
-            "3 vehicles and 1 non-vehicles are too few for a test part of 20%",
-        ),
+        ([1, 1, 1, 0], {}, "3 vehicles and 1 non-vehicles are too few for a test part of 20%"),
         ([], {}, "0 vehicles and 0 non-vehicles are too few"),
         ([1, 1, 0, 0], {"test_size": 1}, r"test_size must be a fraction in \(0, 1\), got 1"),
         ([1, 1, 0, 0], {"test_size": 0}, "test_size must be a number, greater than 0; got 0"),

@@ -191,13 +191,7 @@ def test_scores_are_invariant_to_track_ids_and_row_order(trial, order):
         part = side[chosen]
         tracks = np.array(names)[part["track_id"]]
         renamed.append(
-            TrackTable(
-                part["frame"],
-                tracks,
-                part.boxes,
-                score=part["score"],
-                frame_keys=side.frame_keys,
-            )
+            TrackTable(part["frame"], tracks, part.boxes, score=part["score"], frame_keys=side.frame_keys)
         )
     same(evaluate_tracks(found, labels), evaluate_tracks(*renamed))
 

@@ -175,10 +175,7 @@ def trackeval_hota(found, labels):
 def test_hota_equals_that_of_trackeval(trial):
     found, labels = trial
     labels = TrackTable(
-        labels["frame"],
-        labels["track_id"],
-        labels.boxes,
-        frame_keys={*found.frame_keys, *labels.frame_keys},
+        labels["frame"], labels["track_id"], labels.boxes, frame_keys={*found.frame_keys, *labels.frame_keys}
     )
     scores = evaluate_tracks(found, labels)
     if len(found) or len(labels):

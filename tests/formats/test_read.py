@@ -118,10 +118,7 @@ def test_csv_frames_with_leading_zeros_are_names(tmp_path):
             id="long",
         ),
         (f"{HEADER}\n0,1.5,0,0,9,9,0,0,0\n", "line 2: track must be a whole number, got '1.5'"),
-        (
-            f"{HEADER}\n0,-2,0,0,9,9,0,0,0\n",
-            "line 2: track must be a number from 0, or -1 for none",
-        ),
+        (f"{HEADER}\n0,-2,0,0,9,9,0,0,0\n", "line 2: track must be a number from 0, or -1 for none"),
         (f"{HEADER}\n0,1e99,0,0,9,9,0,0,0\n", "line 2: track must be a number"),
         (f"{HEADER}\n-1,1,0,0,9,9,0,0,0\n", "line 2: frame must be a whole number from 0 or a name, got -1"),
         (f"{HEADER}\n,1,0,0,9,9,0,0,0\n", "line 2: frame is empty"),

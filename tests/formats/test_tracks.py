@@ -338,11 +338,7 @@ def test_an_error_in_the_results_leaves_the_earlier_file(tmp_path, name):
         (7, {}, "results must be a list of FrameResult or a TrackTable, got 7"),
         ("rows", {}, "results must be a list"),
         (pd.DataFrame({"frame": [0]}), {}, "TrackTable.from_pandas"),
-        (
-            RESULTS,
-            {"path": "yolo", "format": "yolo"},
-            r"shape must be \(height, width\)",
-        ),
+        (RESULTS, {"path": "yolo", "format": "yolo"}, r"shape must be \(height, width\)"),
         (RESULTS, {"path": "f", "format": "yolo", "shape": (9, 9)}, "path must be a new or empty folder"),
     ],
 )

@@ -6,12 +6,14 @@ import pytest
 pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
 pytest.importorskip("onnx", reason="export needs onnx, the extra [train]")
 
+from safetensors.torch import save_model
+
 from tests.helpers import drawn, write_frame_set
 from tests.training.networks import random_network
 from tools import rides, train_default
 from vehicle_detection.errors import DatasetError
 from vehicle_detection.network import load_network
-from vehicle_detection.training import NetworkTraining, export_network, rendered_source, save_weights
+from vehicle_detection.training import NetworkTraining, export_network, rendered_source
 
 
 @pytest.fixture
@@ -56,7 +58,7 @@ def quick(monkeypatch):
 def test_the_command_writes_model_card_curves_and_pictures(data, quick, tmp_path, capsys):
     names = "new.onnx", "new.md", "new.csv", "pictures", "w.safetensors"
     model, card, curves, pictures, weights = (tmp_path / name for name in names)
-    save_weights(random_network(), weights)
+    save_model(random_network(), weights)
     words = [data, "-o", model, "--card", card, "--curves", curves, "--pictures", pictures, "--seed", 5]
     words += ["--weights", weights, "--held-out-weights", weights, "--trained-on", "a GPU", "--jobs", 1]
     train_default.main(list(map(str, words)))

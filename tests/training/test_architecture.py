@@ -2,14 +2,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
 
-from vehicle_detection.training.architecture import (  # noqa: E402
-    CENTER,
-    SCALE,
-    STRIDES,
-    Deployed,
-    Network,
-    cell_centers,
-)
+from vehicle_detection.training.architecture import CENTER, SCALE, STRIDES, Deployed, Network, cell_centers  # noqa: E402
 
 
 @pytest.fixture(scope="module")

@@ -75,10 +75,7 @@ def test_a_test_part_of_one_class_has_one_error_rate(patch_set):
     [
         ({"classifiers": {}}, r"classifiers must map names to estimators .* at least one"),
         ({"classifiers": [GaussianNB()]}, r"classifiers must map names to estimators"),
-        (
-            {"classifiers": {"bayes": GaussianNB}},
-            r"classifiers\['bayes'\] must be an estimator .*instance",
-        ),
+        ({"classifiers": {"bayes": GaussianNB}}, r"classifiers\['bayes'\] must be an estimator .*instance"),
         (
             {"classifiers": {"own": SimpleNamespace(fit=print, predict=print)}},
             r"classifiers\['own'\] must be an estimator with fit, predict and get_params",

@@ -13,9 +13,7 @@ from vehicle_detection.training import (  # noqa: E402
     TrainingFrame,
     export_network,
     load_content,
-    load_weights,
     read_weights,
-    save_weights,
     set_metadata,
 )
 from vehicle_detection.training.architecture import Network  # noqa: E402
@@ -145,12 +143,6 @@ def test_files_of_other_kinds_are_refused(files):
     for message, data in cases.items():
         with pytest.raises(ModelFileError, match=message):
             read_weights(data, "own.onnx")
-
-
-def test_saved_weights_are_read_again(network, tmp_path):
-    save_weights(network, tmp_path / "w.safetensors")
-    for name, value in load_weights(tmp_path / "w.safetensors").state_dict().items():
-        assert torch.equal(value, network.state_dict()[name]), name
 
 
 def test_the_metadata_is_json_of_one_key(files):

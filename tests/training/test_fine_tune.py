@@ -156,7 +156,7 @@ def test_bad_input_is_refused_before_the_training(initial, tmp_path, monkeypatch
             [FrameDataset("road", (beside,))],
             r"road, frame 1: the box \[300.0, 10.0, .+ lies outside the 80x60",
         ),
-        ([], "sources must hold at least 1 data set"),
+        ([], "sources must be a list of FrameDataset, one or more"),
     ):
         with pytest.raises(InvalidInputError, match=message):
             tune(initial, sources)

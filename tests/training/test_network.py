@@ -7,12 +7,7 @@ torch = pytest.importorskip("torch", reason="training needs PyTorch, the extra [
 
 from tests.helpers import drawn  # noqa: E402
 from vehicle_detection.errors import InvalidInputError  # noqa: E402
-from vehicle_detection.training import (  # noqa: E402
-    FrameDataset,
-    NetworkTraining,
-    load_training_frames,
-    train_network,
-)
+from vehicle_detection.training import FrameDataset, NetworkTraining, load_training_frames, train_network  # noqa: E402
 from vehicle_detection.training import network as module  # noqa: E402
 
 TRAINING = NetworkTraining(steps=4, batch=2, size=(96, 64), warm_up=2)

@@ -120,12 +120,7 @@ def test_training_again_writes_the_same_file(patch_set, tmp_path, split):
     before = patch_set.patches.copy()
     for name, jobs in (("a", 1), ("b", 3)):
         classifier, report = train_and_evaluate(
-            patch_set,
-            params=SMALL,
-            split=split,
-            seeds=1,
-            jobs=jobs,
-            options=TrainingOptions(random_state=5),
+            patch_set, params=SMALL, split=split, seeds=1, jobs=jobs, options=TrainingOptions(random_state=5)
         )
         classifier.save(tmp_path / name)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()

@@ -23,12 +23,7 @@ from vehicle_detection._common import (
     describe,
     natural_key,
 )
-from vehicle_detection.datasets.archives import (
-    decode_listings,
-    infer_labels,
-    list_patches,
-    parent_folder,
-)
+from vehicle_detection.datasets.archives import decode_listings, infer_labels, list_patches, parent_folder
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE
 

@@ -6,13 +6,7 @@ detections in images with ``confidence``.
 """
 
 from vehicle_detection.formats.read import FORMATS, read_labels, without_suffix
-from vehicle_detection.formats.write import (
-    DIGITS,
-    open_tracks,
-    track_records,
-    write_labels,
-    write_tracks,
-)
+from vehicle_detection.formats.write import DIGITS, open_tracks, track_records, write_labels, write_tracks
 
 __all__ = [
     "DIGITS",

@@ -22,8 +22,6 @@ from .frames import load_training_frames as load_training_frames
 from .frames import select_frames as select_frames
 from .mining import mine_negatives as mine_negatives
 from .network import NetworkTraining as NetworkTraining
-from .network import load_weights as load_weights
-from .network import save_weights as save_weights
 from .network import train_network as train_network
 from .patches import SPLITS as SPLITS
 from .patches import TrainingReport as TrainingReport

@@ -15,12 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    atomic_write,
-    check_number,
-    check_patches,
-    check_path,
-)
+from vehicle_detection._common import atomic_write, check_number, check_patches, check_path
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE, FeatureParams, extract_features
 

@@ -21,12 +21,7 @@ from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.network import NetworkModel, load_network
 from vehicle_detection.tables import FrameKey
 from vehicle_detection.training.export import export_network, set_metadata
-from vehicle_detection.training.frames import (
-    FrameDataset,
-    check_sources,
-    load_training_frames,
-    select_frames,
-)
+from vehicle_detection.training.frames import FrameDataset, check_sources, load_training_frames, select_frames
 from vehicle_detection.training.network import NetworkTraining, train_network
 from vehicle_detection.training.validation import (
     FoldDetections,
@@ -156,42 +151,40 @@ def hold_out(sources: Sequence[FrameDataset]) -> tuple[list[FrameDataset], list[
     Neighboring frames, which may show the same vehicles, stay together: two of ten blocks are held out. At
     least one frame is, unless no vehicle would be left to train on.
     """
-    parts = [(source, part) for source in sources for part in source.sets]
-    if not any((~part.labels["ignore"]).any() for _, part in parts):
+    parts = [part for source in sources for part in source.sets]
+    if not any(map(_shows_vehicle, parts)):
+        frames = pluralize(sum(map(len, parts)), "frame")
         raise InvalidInputError(
-            "sources must show at least one vehicle, got labels of "
-            f"{pluralize(sum(len(part) for _, part in parts), 'frame')} without any; add frames with vehicles"
+            f"sources must show at least one vehicle, got labels of {frames} without any; add frames with "
+            "vehicles"
         )
-    chosen = [set(_held_keys(part.keys)) for _, part in parts]
-    if not any(chosen):
-        chosen[-1] = {parts[-1][1].keys[-1]}
-    kept = [[key for key in part.keys if key not in held] for (_, part), held in zip(parts, chosen)]
-    if not any(
-        (~part.labels.frame(key)["ignore"]).any() for (_, part), keys in zip(parts, kept) for key in keys
-    ):
+    held = {id(part): _held_keys(part.keys) for part in parts}
+    if not any(held.values()):
+        held[id(parts[-1])] = {parts[-1].keys[-1]}
+    kept = _select(sources, lambda part, key: key not in held[id(part)])
+    if not any(_shows_vehicle(part) for source in kept for part in source.sets):
         return list(sources), []
-    held_out = [[key for key in part.keys if key in held] for (_, part), held in zip(parts, chosen)]
-    return [_merge(sources, parts, keys) for keys in (kept, held_out)]  # type: ignore[return-value]
+    return kept, _select(sources, lambda part, key: key in held[id(part)])
 
 
-def _held_keys(keys: Sequence[FrameKey]) -> list[FrameKey]:
+def _shows_vehicle(part: LabelledFrames) -> bool:
+    return bool((~part.labels["ignore"]).any())
+
+
+def _held_keys(keys: Sequence[FrameKey]) -> set[FrameKey]:
     size = math.ceil(len(keys) / _BLOCKS)
-    return [key for number, key in enumerate(keys) if number // size % _EVERY == _HELD]
+    return {key for number, key in enumerate(keys) if number // size % _EVERY == _HELD}
 
 
-def _merge(
-    sources: Sequence[FrameDataset],
-    parts: Sequence[tuple[FrameDataset, LabelledFrames]],
-    keys: Sequence[Sequence[FrameKey]],
+def _select(
+    sources: Sequence[FrameDataset], wanted: Callable[[LabelledFrames, FrameKey], bool]
 ) -> list[FrameDataset]:
     """Return the data sets with some frames of each set; those without any are left out."""
     chosen = []
     for source in sources:
-        sets = [
-            select_frames(part, kept) for (owner, part), kept in zip(parts, keys) if owner is source and kept
-        ]
-        if sets:
-            chosen.append(FrameDataset(source.name, tuple(sets)))
+        keys = [{key for key in part.keys if wanted(part, key)} for part in source.sets]
+        sets = tuple(select_frames(part, kept) for part, kept in zip(source.sets, keys) if kept)
+        chosen += [FrameDataset(source.name, sets)] * bool(sets)
     return chosen
 
 
@@ -260,17 +253,13 @@ def _metadata(
     scores: tuple[Sequence[FoldScore], Sequence[FoldScore]],
 ) -> dict[str, Any]:
     before, after = ({score.name: score.to_dict() for score in each} for each in scores)
-    facts = {name: getattr(training, name) for name in ("steps", "batch", "rate", "random_state")}
-    facts |= {
-        "size": "x".join(map(str, training.size)),
-        "device": device,
-        "initial": training.data.split()[1],
-    }
     data: dict[str, Any] = {source.name: sum(map(len, source.sets)) for source in sources}
     data |= {"held_out": sum(len(part) for source in held_out for part in source.sets)}
+    facts = {name: getattr(training, name) for name in ("steps", "batch", "rate", "random_state")}
+    size, initial = "x".join(map(str, training.size)), training.data.split()[1]
     return {
         "metrics": {"held_out": after, "held_out_before": before},
         "data": data | {"sha256": fingerprint(sources)},
-        "training": facts,
+        "training": facts | {"size": size, "device": device, "initial": initial},
         "versions": package_versions(),
     }

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, check_type, describe, pluralize
+from vehicle_detection._common import check_integer, check_type, describe
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, match_names
@@ -47,28 +47,23 @@ class FrameDataset:
         name: object = self.name
         if not isinstance(name, str) or not name:
             raise InvalidInputError(f"name must be a non-empty string, got {describe(name)}")
-        sets = _entries(self.sets, "sets")
+        sets: object = self.sets
+        if not isinstance(sets, (tuple, list)) or not sets:
+            raise InvalidInputError(f"sets must be a tuple of at least one entry; got {describe(sets)}")
         for part in sets:
             check_type(part, "sets", LabelledFrames, "pass the frames with their labels as LabelledFrames")
-        object.__setattr__(self, "sets", sets)
+        object.__setattr__(self, "sets", tuple(sets))
 
 
-def check_sources(sources: object, *, min_count: int = 1) -> tuple[FrameDataset, ...]:
-    """Return at least `min_count` data sets with different names."""
-    if not isinstance(sources, (tuple, list)):
-        raise InvalidInputError(f"sources must be a list of FrameDataset, got {describe(sources)}")
+def check_sources(sources: object) -> tuple[FrameDataset, ...]:
+    """Return one or more data sets with different names."""
+    if not isinstance(sources, (tuple, list)) or not sources:
+        raise InvalidInputError(
+            f"sources must be a list of FrameDataset, one or more; got {describe(sources)}"
+        )
     for source in sources:
         check_type(source, "sources", FrameDataset, "wrap the frames of each camera or country in one")
     names = [source.name for source in sources]
-    if len(names) < min_count:
-        raise InvalidInputError(
-            f"sources must hold at least {pluralize(min_count, 'data set')}, got {len(names)}; "
-            + (
-                "one at a time is left out for the evaluation: split the frames, such as a set for each drive"
-                if min_count > 1
-                else "add labelled frames"
-            )
-        )
     twice = {name for name in names if names.count(name) > 1}
     if twice:
         raise InvalidInputError(
@@ -220,10 +215,3 @@ def _reduce(image: NDArray[np.uint8], max_side: int | None) -> tuple[NDArray[np.
     size = max(round(width * factor), 1), max(round(height * factor), 1)
     reduced = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     return reduced, np.tile((size[0] / width, size[1] / height), 2)
-
-
-def _entries(values: object, name: str) -> tuple[Any, ...]:
-    """Return the values of a tuple or list with at least one entry."""
-    if not isinstance(values, (tuple, list)) or not values:
-        raise InvalidInputError(f"{name} must be a tuple of at least one entry; got {describe(values)}")
-    return tuple(values)

@@ -9,11 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    check_integer,
-    check_number,
-    check_type,
-)
+from vehicle_detection._common import check_integer, check_number, check_type
 from vehicle_detection.boxes import intersection_matrix, non_max_suppression
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.evaluation import Frames, LabelledFrames, keyed_frames

@@ -88,46 +88,37 @@ def train_network(
         prefetch_factor=4 if workers else None,
         multiprocessing_context="fork" if workers and hasattr(os, "fork") else None,
     )
-    clock = _Clock(state.step, training.steps)
+    first, start, report_is_due = state.step, time.monotonic(), _timer(_REPORT_SECONDS)
+    checkpoint_is_due = _timer(_CHECKPOINT_SECONDS)
     # Forked processes cannot use the threads of OpenCV.
     with single_threaded_opencv(), _torch_settings(jobs):
         for images, boxes, usable, ignored in batches:
             targets = Targets(*(each.to(place, non_blocking=True) for each in (boxes, usable, ignored)))
             losses = state.update(images.to(place, non_blocking=True), targets, centers)
-            if clock.report_is_due(state.step):
+            if report_is_due() or state.step == training.steps:
                 score, box = (each.item() for each in losses)
-                report(state.step, f"{clock.describe(state.step)}, losses {score:.3f} + {box:.3f}")
-            if checkpoint is not None and clock.checkpoint_is_due():
+                passed = time.monotonic() - start
+                left = passed / (state.step - first) * (training.steps - state.step)
+                times = f"{_minutes(passed)} min, {_minutes(left)} min left"
+                progress = f"step {state.step} of {training.steps}"
+                report(state.step, f"{progress}: {times}, losses {score:.3f} + {box:.3f}")
+            if checkpoint is not None and checkpoint_is_due():
                 state.save(checkpoint)
     average: Network = state.average.cpu().eval()
     return average
 
 
-class _Clock:
-    """When to report and to write a checkpoint, and how long a training takes."""
+def _timer(seconds: float) -> Callable[[], bool]:
+    """Return a function that tells whether so many seconds have passed since it last said so."""
+    last = time.monotonic()
 
-    def __init__(self, first: int, steps: int) -> None:
-        self._first, self._steps = first, steps
-        self._start = self._reported = self._saved = time.monotonic()
+    def is_due() -> bool:
+        nonlocal last
+        due = time.monotonic() - last >= seconds
+        last = time.monotonic() if due else last
+        return due
 
-    def report_is_due(self, step: int) -> bool:
-        now = time.monotonic()
-        if now - self._reported < _REPORT_SECONDS and step != self._steps:
-            return False
-        self._reported = now
-        return True
-
-    def checkpoint_is_due(self) -> bool:
-        now = time.monotonic()
-        if now - self._saved < _CHECKPOINT_SECONDS:
-            return False
-        self._saved = now
-        return True
-
-    def describe(self, step: int) -> str:
-        passed = time.monotonic() - self._start
-        left = passed / (step - self._first) * (self._steps - step)
-        return f"step {step} of {self._steps}: {_minutes(passed)} min, {_minutes(left)} min left"
+    return is_due
 
 
 def _minutes(seconds: float) -> str:
@@ -199,10 +190,7 @@ class _State:
                     module.eval()
         kernels = [each for each in network.parameters() if each.ndim > 1]
         others = [each for each in network.parameters() if each.ndim <= 1]
-        groups = [
-            {"params": kernels, "weight_decay": _WEIGHT_DECAY},
-            {"params": others, "weight_decay": 0.0},
-        ]
+        groups = [{"params": kernels, "weight_decay": _WEIGHT_DECAY}, {"params": others, "weight_decay": 0.0}]
         return cls(network, average, torch.optim.AdamW(groups, lr=training.rate, fused=True), training)
 
     def update(self, images: Tensor, targets: Targets, centers: Tensor) -> tuple[Tensor, Tensor]:
@@ -255,13 +243,8 @@ class _State:
                 "those, or remove it to start again"
             )
         for prefix, module in ("network.", self.network), ("average.", self.average):
-            module.load_state_dict(
-                {
-                    name.removeprefix(prefix): value
-                    for name, value in tensors.items()
-                    if name.startswith(prefix)
-                }
-            )
+            of_module = [name for name in tensors if name.startswith(prefix)]
+            module.load_state_dict({name.removeprefix(prefix): tensors[name] for name in of_module})
         parameters = [each for group in self.optimizer.param_groups for each in group["params"]]
         state: dict[int, dict[str, Tensor]] = {}
         for name, value in tensors.items():
@@ -277,22 +260,3 @@ class _State:
 def _multiplies_bfloat16(device: torch.device) -> bool:
     """Whether the device is faster with bfloat16 than with float32."""
     return device.type == "cuda" or bool(torch.cpu._is_amx_tile_supported())
-
-
-def save_weights(network: Network, path: Path) -> None:
-    """Write the weights of a network as a safetensors file, to continue from."""
-    from safetensors.torch import save
-
-    tensors = {name: value.contiguous() for name, value in network.state_dict().items()}
-    with atomic_write(path, "path") as part:
-        part.write_bytes(save(tensors))
-
-
-def load_weights(path: Path) -> Network:
-    """Read a network from a file of `save_weights`."""
-    from safetensors.torch import load_file
-
-    network = Network()
-    network.load_state_dict(load_file(path))
-    network.eval()
-    return network

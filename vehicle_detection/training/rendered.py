@@ -11,14 +11,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer
 from vehicle_detection.evaluation import LabelledFrames
-from vehicle_detection.scenes import (
-    Drive,
-    Scene,
-    SceneVehicle,
-    VehicleTruth,
-    render_drive,
-    render_scene,
-)
+from vehicle_detection.scenes import Drive, Scene, SceneVehicle, VehicleTruth, render_drive, render_scene
 from vehicle_detection.tables import FrameKey, TrackTable
 from vehicle_detection.training.frames import FrameDataset
 

@@ -16,21 +16,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    check_path,
-    check_sequence,
-    describe,
-    is_listing,
-)
+from vehicle_detection._common import check_path, check_sequence, describe, is_listing
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.detector import Detector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import (
-    LabelledFrames,
-    best_f1,
-    evaluate_detections,
-    precision_recall_curve,
-)
+from vehicle_detection.evaluation import LabelledFrames, best_f1, evaluate_detections, precision_recall_curve
 from vehicle_detection.features import FeatureParams
 from vehicle_detection.regions import RegionParams
 from vehicle_detection.search import SearchParams
