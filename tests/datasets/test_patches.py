@@ -36,11 +36,6 @@ def test_a_notebook_shows_the_counts_as_a_table():
     assert "total" in make_set(["a.png"])[[]]._repr_html_()
 
 
-def test_counts_are_in_natural_order():
-    patches = make_set(["a/GTI10/1.png", "a/GTI9/1.png", "b/GTI9/1.png", "alone.png"])
-    assert list(patches.counts().items()) == [("", 1), ("GTI9", 2), ("GTI10", 1)]
-
-
 @pytest.mark.parametrize("rows", [[2, 0], np.array([True, False, True]), slice(None, None, -1), []])
 def test_selecting_rows(rows):
     patches = PatchSet(np.stack([patch_image(i) for i in range(3)]), [1, 0, 1], ["0.png", "1.png", "2.png"])
@@ -72,13 +67,6 @@ def test_a_single_row_is_rejected():
 def test_invalid_attributes(patches, labels, names, message):
     with pytest.raises(InvalidInputError, match=message):
         PatchSet(patches, labels, names)
-
-
-def test_an_empty_set_has_no_balance():
-    empty = make_set(["a.png"])[[]]
-    assert len(empty) == 0
-    assert np.isnan(empty.balance)
-    assert empty.counts() == {}
 
 
 @given(st.data())
@@ -129,11 +117,6 @@ def test_a_zip_and_the_folder_it_unpacks_to_are_the_same_set(vehicles_zip, tmp_p
     np.testing.assert_array_equal(from_zip.patches, from_folder.patches)
     assert from_zip.labels.all()
     assert from_zip.fingerprint == from_folder.fingerprint
-
-
-def test_the_order_in_the_zip_does_not_matter(vehicles_zip, tmp_path):
-    backwards = write_zip(tmp_path / "backwards.zip", dict(reversed(VEHICLES.items())))
-    assert load_patches(backwards).names == load_patches(vehicles_zip).names
 
 
 @pytest.mark.parametrize("jobs", [1, 2, 7])
@@ -195,23 +178,6 @@ def test_patches_of_another_size_are_named(tmp_path):
         load_patches(source)
     half = write_zip(tmp_path / "half.zip", {"cars/2.png": png(2, side=32)})
     assert load_patches(half, size=32).patches.shape == (1, 32, 32, 3)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"size": 0}, "size must be an integer from 1 to 4096; got 0"),
-        ({"jobs": 0}, "jobs must be an integer from 1 to 1024; got 0"),
-    ],
-)
-def test_invalid_options(vehicles_zip, options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        load_patches(vehicles_zip, **options)
-
-
-def test_a_source_must_be_a_path():
-    with pytest.raises(InvalidInputError, match=r"source must be the path of a folder or zip, got 3"):
-        load_patches(3)
 
 
 def test_a_missing_source_is_named(tmp_path):
@@ -284,13 +250,6 @@ def test_an_unreadable_folder_is_not_skipped(vehicles_zip, tmp_path, monkeypatch
         DatasetError, match=r"GTI_Far cannot be read: Permission denied; check its permissions"
     ):
         load_patches(folder)
-
-
-def test_progress_is_shown_on_request(vehicles_zip, capsys):
-    load_patches(vehicles_zip)
-    assert capsys.readouterr().err == ""
-    load_patches(vehicles_zip, progress=True)
-    assert "3/3" in capsys.readouterr().err
 
 
 def test_the_argument_gives_the_label_of_training_patches(vehicles_zip, others_zip):

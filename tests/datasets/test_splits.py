@@ -37,14 +37,6 @@ def test_a_random_split_covers_all_patches_and_keeps_the_balance(labels, fractio
         assert abs(np.sum(labels[split.test] == label) - expected) <= 1
 
 
-def test_a_random_split_depends_on_the_seed_only():
-    patches = set_of([(folder, number) for folder in FOLDERS for number in range(10)])
-    first, again = (split_random(patches, random_state=1) for _ in range(2))
-    np.testing.assert_array_equal(first.test, again.test)
-    np.testing.assert_array_equal(first.test, split_random(patches.labels, random_state=1).test)
-    assert first.test.tolist() != split_random(patches, random_state=2).test.tolist()
-
-
 @pytest.mark.parametrize(
     ("labels", "options", "message"),
     [
@@ -109,12 +101,6 @@ def test_an_impossible_split_by_source(options, message):
     patches = set_of([(folder, 1) for folder in FOLDERS])
     with pytest.raises(InvalidInputError, match=message):
         split_sources(patches, **options)
-
-
-def test_sources_of_neither_part_are_left_out():
-    patches = set_of([(folder, 1) for folder in (*FOLDERS, "non-vehicles/mined")])
-    split = split_sources(patches)
-    assert 4 not in [*split.train, *split.test]
 
 
 @pytest.mark.parametrize(

@@ -84,20 +84,11 @@ def test_csv_labels_need_only_frames_tracks_and_boxes(tmp_path, name):
     assert ignored["ignore"].tolist() == [True]
 
 
-def test_csv_frames_with_leading_zeros_are_names(tmp_path):
-    text = f"{HEADER}\n007,1,0,0,9,9,0,0,0\n"
-    assert read_labels(written(tmp_path, text))["frame"].tolist() == ["007"]
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "lacks the columns frame, track, .* found an empty file"),
-        (
-            "frame,x1,y1,x2,y2\n",
-            "lacks the columns track; found frame, x1, .*labels have frame,track,x1,y1,x2,y2 and, "
-            "optionally, occluded,truncated,ignore; predictions frame,track_id",
-        ),
+        ("frame,x1,y1,x2,y2\n", "lacks the columns track; found frame, x1, .*labels have .*; predictions"),
         ("frame,score,x1,y1,x2,y2\n", "lacks the columns track_id; found"),
         ("0,1,2,3,4,5,0,0,0\n", "lacks the columns frame.* found 0, 1, 2"),
         (HEADER + ",x1\n", "has the column x1 more than once"),
@@ -107,26 +98,16 @@ def test_csv_frames_with_leading_zeros_are_names(tmp_path):
         (f"{HEADER}\n0,1,0,0,,9,0,0,0\n", "line 2: x2 must be a finite number, got ''"),
         (f"{HEADER}\n0,1,0,0,-9,9,0,0,0\n", r"line 2: a box needs x1 < x2 and y1 < y2, got \[0.0, 0.0, -9.0"),
         (f"{HEADER}\n0,1,0,5,9,5,0,0,0\n", "line 2: a box needs x1 < x2 and y1 < y2"),
-        (
-            f"{HEADER}\n4,1,0,0,9,9,0,0,0\n4,1,1,0,9,9,0,0,0\n",
-            "line 3: track 1 comes twice in frame 4, first at .* line 2",
-        ),
+        (f"{HEADER}\n4,1,0,0,9,9,0,0,0\n4,1,1,0,9,9,0,0,0\n", "line 3: track 1 comes twice in .* line 2"),
         (f"{HEADER}\n0,1,0,0,9,9,0,0,2\n", "line 2: ignore must be 0 or 1, got '2'"),
-        pytest.param(
-            f"{HEADER}\n0,1,0,0,{'9' * 130_000},9,0,0,2\n",
-            r"line 2: x2 must be a finite number, got '9{76}\.\.\.$",
-            id="long",
-        ),
+        pytest.param(f"{HEADER}\n0,1,0,0,{'9' * 130_000},9,0,0,2\n", r"got '9{76}\.\.\.$", id="long"),
         (f"{HEADER}\n0,1.5,0,0,9,9,0,0,0\n", "line 2: track must be a whole number, got '1.5'"),
         (f"{HEADER}\n0,-2,0,0,9,9,0,0,0\n", "line 2: track must be a number from 0, or -1 for none"),
         (f"{HEADER}\n0,1e99,0,0,9,9,0,0,0\n", "line 2: track must be a number"),
         (f"{HEADER}\n-1,1,0,0,9,9,0,0,0\n", "line 2: frame must be a whole number from 0 or a name, got -1"),
         (f"{HEADER}\n,1,0,0,9,9,0,0,0\n", "line 2: frame is empty"),
         (f"{HEADER}\n0,1,0,0,9,9,0,1.5,0\n", "line 2: truncated must be a fraction from 0 to 1, got '1.5'"),
-        (
-            f"{HEADER}\n0,1,0,0,9,9,0,0,0\n".replace(",", ";").replace(";9;9;", ";9,5;9;"),
-            "use a decimal point",
-        ),
+        (f"{HEADER}\n0,1,0,0,9".replace(",", ";") + ",5;9;0;0;0\n", "use a decimal point"),
         (f'{HEADER}\n"0,1', "not CSV text"),
         (HEADER.encode() + b"\n\xff\xfe", "is not UTF-8 text; save it as UTF-8"),
     ],
@@ -201,6 +182,9 @@ def coco(**changes):
     return json.dumps({**data, **changes})
 
 
+BOX = {"image_id": 5, "category_id": 1, "bbox": [1, 2, 3, 4]}
+
+
 def test_coco_file(tmp_path):
     labels = read_labels(written(tmp_path, coco(), "instances.json"))
     assert labels.frame_keys == ("a.jpg", "b.jpg")
@@ -208,13 +192,9 @@ def test_coco_file(tmp_path):
     assert labels["ignore"].tolist() == [False, True, True]
     assert labels["track_id"].tolist() == [-1, 2, -1]
     assert len(read_labels(written(tmp_path, coco(), "coco.txt"), classes=["person"])) == 2
-    entry = {"image_id": 5, "category_id": 1, "bbox": [1, 2, 3, 4], "track_id": 9, "score": 0.5}
+    entry = BOX | {"track_id": 9, "score": 0.5}
     found = read_labels(written(tmp_path, coco(annotations=[entry], images=[{"id": 5}]), "a.json"))
-    assert (tuple(found["frame"].tolist()), found["track_id"].tolist(), found["score"].tolist()) == (
-        (5,),
-        [9],
-        [0.5],
-    )
+    assert [found[name].tolist() for name in ("frame", "track_id", "score")] == [[5], [9], [0.5]]
 
 
 @pytest.mark.parametrize(
@@ -227,21 +207,9 @@ def test_coco_file(tmp_path):
         ("a.json", coco(images=[{"id": 5}, {"id": 6, "file_name": "a"}]), "give every image a file_name"),
         ("a.json", coco(images=[{"id": 5}, {"id": 5}]), "two images share an id"),
         ("a.json", coco(images=[]), "annotation 0: expected bbox .* image_id"),
-        (
-            "a.json",
-            coco(annotations=[{"image_id": 5, "category_id": 1, "bbox": [1, 2]}]),
-            "annotation 0: expected bbox",
-        ),
-        (
-            "a.json",
-            coco(annotations=[{"image_id": 5, "category_id": 1, "bbox": [1, 2, 0, 5]}]),
-            "annotation 0: a box needs x1 < x2",
-        ),
-        (
-            "a.json",
-            coco(categories=[{"id": 1, "name": "boat"}]),
-            "no category among bus, car, .* found 'boat'",
-        ),
+        ("a.json", coco(annotations=[BOX | {"bbox": [1, 2]}]), "annotation 0: expected bbox"),
+        ("a.json", coco(annotations=[BOX | {"bbox": [1, 2, 0, 5]}]), "annotation 0: a box needs x1 < x2"),
+        ("a.json", coco(categories=[{"id": 1, "name": "boat"}]), "no category among bus, .* found 'boat'"),
         ("a.jsonl", '{"frame": 0}\n', "lacks the columns track, x1, .*; found frame"),
         ("a.jsonl", "{", "line 1: not a JSON object"),
         ("a.jsonl", "\n[]", "line 2: expected a JSON object, found"),
@@ -496,27 +464,6 @@ def test_invalid_yolo_files(tmp_path, line, message):
         read_labels(tmp_path, format="yolo", shape=(100, 200))
 
 
-def test_labels_without_tracks_have_no_track_scores(tmp_path):
-    """KITTI and COCO have no identities; a track for each box would give wrong IDF1 and HOTA."""
-    for frame in range(2):
-        written(tmp_path, f"Car 0 0 0 {10 + frame} 10 90 70 1 1 1 1 1 1 1\n", f"{frame:06d}.txt")
-    labels = read_labels(tmp_path)
-    found = TrackTable(labels["frame"], [1, 1], labels.boxes)
-    with pytest.raises(InvalidInputError, match="labels must have a track for every box"):
-        evaluate_tracks(found, labels)
-
-
-@pytest.mark.parametrize("track", ["track", "track_id"])
-def test_a_table_with_tracks_and_scores_holds_predictions(tmp_path, track):
-    text = f"frame,{track},x1,y1,x2,y2,score\n0,1,0,0,50,40,2.5\n0,2,200,0,250,40,0.1\n"
-    found = read_labels(written(tmp_path, text))
-    assert (found["track_id"].tolist(), found["score"].tolist()) == ([1, 2], [2.5, 0.1])
-
-
-def test_a_text_file_without_boxes_is_one_of_predictions(tmp_path):
-    assert read_labels(written(tmp_path, "", "none.txt")).frame_keys == ()
-
-
 @pytest.mark.parametrize(
     ("names", "text", "known"),
     [
@@ -557,11 +504,6 @@ def test_numbers_that_only_python_reads(tmp_path):
             read_labels(written(tmp_path, '{"frame": ' + "9" * 5000 + "}", name))
 
 
-def test_blank_lines_of_an_archive_of_cvat(tmp_path):
-    path = write_zip(tmp_path / "a.zip", "1,1,0,0,20,10,1,1,1\n,\t\n")
-    assert len(read_labels(path)) == 1
-
-
 def test_an_empty_column_of_scores_is_one_of_labels(tmp_path):
     text = "frame,track,x1,y1,x2,y2,score\n0,3,1,2,30,40,\n"
     labels = read_labels(written(tmp_path, text))
@@ -587,7 +529,3 @@ def test_classes_of_a_table(tmp_path, name):
     assert (people["frame"].tolist(), people["ignore"].tolist()) == ([0, 1, 2], [False, True, False])
     with pytest.raises(DatasetError, match="has no class among boat; found 'car', 'person', 'tram'"):
         read_labels(tmp_path / name, classes=["boat"])
-
-
-def test_a_column_of_numbers_is_none_of_classes(tmp_path):
-    assert len(read_labels(written(tmp_path, "frame,track,x1,y1,x2,y2,label\n0,1,0,0,50,40,7\n"))) == 1

@@ -4,7 +4,6 @@ import csv
 import json
 import os
 import sys
-import zipfile
 from types import SimpleNamespace
 
 import numpy as np
@@ -173,16 +172,6 @@ def test_mot_counts_from_one(tmp_path):
     assert [line.split(",")[0] for line in lines] == ["1", "1", "3"]
 
 
-@pytest.mark.filterwarnings("ignore:Operation with tuple")  # motmetrics and a new pandas
-def test_the_tools_of_mot_read_it(tmp_path):
-    metrics = pytest.importorskip("motmetrics")
-    write_tracks(RESULTS, tmp_path / "t.txt")
-    table = metrics.io.loadtxt(str(tmp_path / "t.txt"), fmt="mot15-2D", min_confidence=-10)
-    assert table.index.tolist() == [(1, 1), (1, 2), (3, 1)]
-    first = table.iloc[0]
-    assert (first.X, first.Y, first.Width, first.Height) == (10.0, 20.0, 40.25, 40.5)
-
-
 def test_coco_is_a_data_set(tmp_path):
     write_tracks(RESULTS, tmp_path / "t.json", shape=(720, 1280, 3))
     data = json.loads((tmp_path / "t.json").read_text())
@@ -279,17 +268,6 @@ def test_detections_in_images(tmp_path):
     assert names[alone["id"]] == alone["file_name"]
     with pytest.raises(InvalidInputError, match=r"path must end in .csv, .jsonl, .ndjson, .parquet, .json"):
         write_tracks(found, tmp_path / "b.txt")
-
-
-def test_the_archive_for_cvat(tmp_path):
-    write_tracks(RESULTS, tmp_path / "t.zip")
-    with zipfile.ZipFile(tmp_path / "t.zip") as archive:
-        assert sorted(archive.namelist()) == ["gt/gt.txt", "gt/labels.txt"]
-        assert archive.read("gt/labels.txt") == b"vehicle\n"
-        lines = archive.read("gt/gt.txt").decode().splitlines()
-    # Frames count from 1 and pixels from 0; the flag, the class and the visible fraction are 1.
-    assert lines[0] == "1,1,10.0,20.0,40.25,40.5,1,1,1.0"
-    assert len(lines) == 3
 
 
 def test_a_yolo_folder_has_a_file_for_each_frame(tmp_path):

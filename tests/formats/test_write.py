@@ -295,64 +295,36 @@ def test_results_take_the_ids_of_a_foreign_ground_truth(tmp_path):
 # --- invalid input ---
 
 
+ONE, NAMED = boxes_of((0, 1, CAR)), boxes_of(("a", 1, CAR))
+TWICE = boxes_of(("a.jpg", 1, CAR), ("a.png", 1, CAR))
+WIDE = boxes_of((0, 1, CAR), (4, 1, [0, 0, 301, 60]))
+YOLO = {"format": "yolo", "shape": (99, 200)}
+KITTI, RESULTS = {"format": "kitti"}, {"format": "coco_results"}
+
+
 @pytest.mark.parametrize(
     ("boxes", "name", "options", "message"),
     [
         ([], "t.csv", {}, "labels must be a TrackTable, got"),
-        (boxes_of((0, 1, CAR)), "t.xlsx", {}, "path must end in .csv, .jsonl, .*or set the format to 'csv'"),
-        (boxes_of((0, 1, CAR)), "t.csv", {"format": "voc"}, "format must be one of 'csv', .* 'kitti'"),
-        (boxes_of((0, 1, CAR)), "missing/t.csv", {}, "path needs an existing folder"),
-        (boxes_of(("a", 1, CAR)), "missing/t", {"format": "kitti"}, "path needs an existing folder"),
-        (boxes_of((0, 1, CAR)), "t", {"format": "kitti"}, "frames that are file names for KITTI, got 0"),
-        (
-            boxes_of(("a/b", 1, CAR)),
-            "t",
-            {"format": "kitti"},
-            "frames that are file names for KITTI, got 'a/b'",
-        ),
-        (
-            boxes_of(("7", 1, CAR)),
-            "t.csv",
-            {},
-            "frame names that CSV does not tell from numbers, such as '7'",
-        ),
+        (ONE, "t.xlsx", {}, "path must end in .csv, .jsonl, .*or set the format to 'csv'"),
+        (ONE, "t.csv", {"format": "voc"}, "format must be one of 'csv', .* 'kitti'"),
+        (ONE, "missing/t.csv", {}, "path needs an existing folder"),
+        (NAMED, "missing/t", KITTI, "path needs an existing folder"),
+        (ONE, "t", KITTI, "frames that are file names for KITTI, got 0"),
+        (boxes_of(("a/b", 1, CAR)), "t", KITTI, "frames that are file names for KITTI, got 'a/b'"),
+        (boxes_of(("7", 1, CAR)), "t.csv", {}, "names that CSV does not tell from numbers, such as '7'"),
         (boxes_of((" a", 1, CAR)), "t.csv", {}, "labels name a frame ' a'; CSV drops the spaces"),
-        (boxes_of(("a", 1, CAR)), "t.txt", {}, "labels must have numbered frames for MOT, got 'a'"),
-        (
-            boxes_of((0, 1, CAR, 0.5), ignore=[True]),
-            "t.txt",
-            {},
-            "labels hold predictions marked ignore, which the format 'mot' cannot mark",
-        ),
-        (boxes_of((0, 1, CAR)), "t.json", {"format": "coco_results"}, "labels need scores for COCO results"),
-        (boxes_of((0, 1, CAR, 0.5)), "t.json", {"format": "coco_results"}, "truth must name the COCO ground"),
-        (boxes_of(("a", 1, CAR)), "t.zip", {}, "labels must have numbered frames for MOT, got 'a'"),
-        (boxes_of((0, 1, CAR)), "t", {"format": "yolo"}, "shape must be .* for YOLO"),
-        (
-            boxes_of((0, 1, CAR), ignore=[True]),
-            "t",
-            {"format": "yolo", "shape": (99, 199)},
-            "labels hold boxes marked ignore, which YOLO cannot mark",
-        ),
-        (
-            boxes_of(("a.jpg", 1, CAR), ("a.png", 1, CAR)),
-            "t",
-            {"format": "yolo", "shape": (99, 199)},
-            "the frames 'a.jpg' and 'a.png', which are one file in YOLO; rename them",
-        ),
-        (
-            boxes_of(("a.jpg", 1, CAR), ("a.png", 1, CAR)),
-            "t",
-            {"format": "kitti"},
-            "the frames 'a.jpg' and 'a.png', which are one file in KITTI; rename them",
-        ),
-        (
-            boxes_of((0, 1, CAR), (4, 1, [0, 0, 301, 60])),
-            "t",
-            {"format": "yolo", "shape": (99, 200)},
-            r"box \[0.0, 0.0, 301.0, 60.0\] in frame 4, beyond the 200x99 pixels of shape; .* clip_boxes",
-        ),
-        (boxes_of((0, 1, CAR)), "t.csv", {"truth": "x.json"}, "truth must be None for the format 'csv'"),
+        (NAMED, "t.txt", {}, "labels must have numbered frames for MOT, got 'a'"),
+        (NAMED, "t.zip", {}, "labels must have numbered frames for MOT, got 'a'"),
+        (boxes_of((0, 1, CAR, 0.5), ignore=[True]), "t.txt", {}, "marked ignore, which the format 'mot'"),
+        (ONE, "t.json", RESULTS, "labels need scores for COCO results"),
+        (boxes_of((0, 1, CAR, 0.5)), "t.json", RESULTS, "truth must name the COCO ground"),
+        (ONE, "t", {"format": "yolo"}, "shape must be .* for YOLO"),
+        (boxes_of((0, 1, CAR), ignore=[True]), "t", YOLO, "labels hold boxes marked ignore, which YOLO"),
+        (TWICE, "t", YOLO, "the frames 'a.jpg' and 'a.png', which are one file in YOLO; rename them"),
+        (TWICE, "t", KITTI, "the frames 'a.jpg' and 'a.png', which are one file in KITTI; rename them"),
+        (WIDE, "t", YOLO, r"box \[0.0, 0.0, 301.0, 60.0\] in frame 4, beyond the 200x99 .* clip_boxes"),
+        (ONE, "t.csv", {"truth": "x.json"}, "truth must be None for the format 'csv'"),
     ],
 )
 def test_invalid_arguments(tmp_path, monkeypatch, boxes, name, options, message):
@@ -371,11 +343,6 @@ def test_frames_that_the_truth_does_not_have(tmp_path, kind):
         )
     with pytest.raises(DatasetError, match=r"none.json does not exist; check the path"):
         write_labels(boxes_of((0, 1, CAR, 0.5)), tmp_path / "t.json", truth=tmp_path / "none.json")
-
-
-def test_kitti_files_have_the_names_of_their_images(tmp_path):
-    write_labels(boxes_of(("a.jpg", 1, CAR), ("b.5", 1, CAR)), tmp_path / "kitti", format="kitti")
-    assert {path.name for path in (tmp_path / "kitti").iterdir()} == {"a.txt", "b.5.txt"}
 
 
 def test_kitti_never_mixes_with_older_files(tmp_path):

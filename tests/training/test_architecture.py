@@ -38,9 +38,3 @@ def test_the_deployed_network_returns_the_same_boxes(network):
     torch.testing.assert_close(probability, logits.sigmoid())
     corners = torch.stack([x - w / 2, y - h / 2, x + w / 2, y + h / 2], 1)
     torch.testing.assert_close(corners, boxes, atol=1e-3, rtol=1e-4)
-
-
-def test_an_untrained_network_finds_hardly_anything(network):
-    with torch.no_grad():
-        logits, _ = network(torch.randint(256, (1, 64, 64, 3), dtype=torch.uint8))
-    assert logits.sigmoid().mean() == pytest.approx(0.02, abs=0.01)

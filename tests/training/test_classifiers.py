@@ -5,7 +5,6 @@ import pytest
 from sklearn.naive_bayes import GaussianNB
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
-from sklearn.svm import LinearSVC
 from sklearn.tree import DecisionTreeClassifier
 
 from tests.training.trial_cases import SMALL
@@ -53,12 +52,6 @@ def test_naive_bayes_and_a_linear_svm_are_compared_by_default(patch_set, tmp_pat
         patch_set, params=PARAMS, cache=FeatureCache(patch_set.patches, folder=tmp_path)
     )
     assert again["accuracy"].tolist() == first["accuracy"].tolist()
-
-
-def test_the_given_classifiers_stay_untrained(patch_set):
-    model = LinearSVC()
-    compare_classifiers(patch_set, {"svm": model}, params=PARAMS)
-    assert not hasattr(model, "coef_")
 
 
 def test_a_test_part_of_one_class_has_one_error_rate(patch_set):

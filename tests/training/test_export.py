@@ -1,5 +1,3 @@
-import json
-
 import numpy as np
 import pytest
 
@@ -8,7 +6,7 @@ onnx = pytest.importorskip("onnx", reason="export needs onnx, the extra [train]"
 
 from tests.training.networks import random_network  # noqa: E402
 from vehicle_detection.errors import ModelFileError  # noqa: E402
-from vehicle_detection.network import METADATA_KEY, load_network, open_session  # noqa: E402
+from vehicle_detection.network import load_network, open_session  # noqa: E402
 from vehicle_detection.training import (  # noqa: E402
     TrainingFrame,
     export_network,
@@ -143,10 +141,3 @@ def test_files_of_other_kinds_are_refused(files):
     for message, data in cases.items():
         with pytest.raises(ModelFileError, match=message):
             read_weights(data, "own.onnx")
-
-
-def test_the_metadata_is_json_of_one_key(files):
-    model = onnx.load_model_from_string(files[True])
-    values = {each.key: each.value for each in model.metadata_props}
-    assert json.loads(values[METADATA_KEY])["format_version"] == 1
-    assert values["names"] == "{0: 'vehicle'}"

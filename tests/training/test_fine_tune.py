@@ -100,10 +100,6 @@ def test_one_frame_is_trained_on_and_not_evaluated(initial):
     assert tuned.model.metadata["data"]["held_out"] == 0
 
 
-def test_steps_follow_from_the_number_of_frames():
-    assert [fine_tune.default_steps(count) for count in (1, 40, 160, 5000)] == [200, 200, 800, 1200]
-
-
 # --- hold_out ---
 
 

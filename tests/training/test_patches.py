@@ -1,5 +1,4 @@
 import dataclasses
-import io
 import json
 
 import numpy as np
@@ -157,14 +156,6 @@ def test_impossible_splits_are_skipped():
         train_and_evaluate(single, params=SMALL, split="sequences")
 
 
-def test_a_split_with_one_class_is_skipped():
-    patches, labels = rendered_patches(24)
-    # All vehicles are alone in their folders: the split by sequences tests on the others only.
-    names = [f"{number}/1.png" if label else f"others/{number}.png" for number, label in enumerate(labels)]
-    _, report = train_and_evaluate(PatchSet(patches, labels, names), params=SMALL, seeds=1)
-    assert report.skipped["sequences"] == "one side of the split lacks a class; pass more patches"
-
-
 def test_reports_are_json(trained):
     _, report = trained
     plain = json.loads(json.dumps(report.to_dict()))
@@ -174,21 +165,6 @@ def test_reports_are_json(trained):
     assert plain["splits"]["sequences"]["accuracy"] == report.splits["sequences"].accuracy
     assert (plain["features"], plain["balance"]) == (report.features, 0.5)
     assert dataclasses.replace(report, params=FeatureParams.preset("lab-8460")).features == "lab-8460"
-
-
-def test_the_progress_bar_is_shown_on_a_terminal_only(patch_set, monkeypatch, capsys):
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    train_and_evaluate(patch_set[::4], params=SMALL, seeds=1, progress=True)
-    assert capsys.readouterr().err == ""
-    terminal = Terminal()
-    monkeypatch.setattr("sys.stderr", terminal)
-    train_and_evaluate(patch_set[::4], params=SMALL, seeds=1)
-    assert terminal.getvalue() == ""
-    train_and_evaluate(patch_set[::4], params=SMALL, seeds=1, progress=True)
-    assert "4/4" in terminal.getvalue()  # the two splits that these allow, the probabilities, and the model
 
 
 # --- the card ---

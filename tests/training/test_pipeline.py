@@ -3,8 +3,7 @@ import pickle
 
 import numpy as np
 import pytest
-from sklearn.base import clone
-from sklearn.model_selection import GridSearchCV, cross_val_score
+from sklearn.model_selection import cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
@@ -30,14 +29,6 @@ def test_the_transformer_has_the_fields_and_defaults_of_feature_params():
     arguments = PatchFeatures().get_params()
     assert arguments.pop("jobs") is None
     assert arguments == dataclasses.asdict(FeatureParams())
-
-
-def test_the_transformer_can_be_cloned_and_set():
-    transformer = PatchFeatures(orient=6)
-    copy = clone(transformer)
-    assert copy is not transformer
-    assert copy.get_params() == transformer.get_params()
-    assert copy.set_params(orient=7).to_params().orient == 7
 
 
 def test_fit_checks_the_parameters():
@@ -108,18 +99,6 @@ def test_the_transformer_passes_the_estimator_checks_that_apply():
     assert len(passed) >= 20
 
 
-def test_the_transformer_states_that_it_needs_no_tables_and_no_fit():
-    pytest.importorskip("sklearn", minversion="1.6")
-    from sklearn.utils import get_tags
-
-    tags = get_tags(PatchFeatures())
-    assert not tags.input_tags.two_d_array
-    assert not tags.input_tags.three_d_array  # images in color have four dimensions
-    assert tags.no_validation
-    assert not tags.requires_fit
-    assert tags.transformer_tags.preserves_dtype == []
-
-
 def test_the_transformer_depends_on_each_patch_alone():
     transformer = PatchFeatures(jobs=1)
     expected = transformer.fit_transform(PATCHES)
@@ -149,18 +128,3 @@ def test_the_transformer_in_cross_validation():
     assert cross_val_score(pipeline, patches, labels, cv=4, error_score="raise").mean() >= 0.9
     named = make_pipeline(features).set_output(transform="pandas").fit_transform(patches[:2])
     assert list(named.columns[:2]) == ["spatial0", "spatial1"]
-
-
-def test_the_transformer_in_a_grid_search():
-    patches = np.concatenate([PATCHES[:4]] * 2 + [PATCHES[5:9]] * 2)
-    labels = np.repeat([1, 0], 8)
-    pipeline = make_pipeline(
-        PatchFeatures(spatial_size=8, hist_bins=8, jobs=1),
-        StandardScaler(),
-        LinearSVC(C=1e-3, random_state=0),
-    )
-    grid = {"patchfeatures__orient": [4, 6], "patchfeatures__hog_channel": [0, "GRAY"]}
-    search = GridSearchCV(pipeline, grid, cv=2, error_score="raise").fit(patches, labels)
-    assert len(search.cv_results_["params"]) == 4
-    assert search.predict(patches).shape == (16,)
-    assert search.best_estimator_.score(patches, labels) > 0.9

@@ -4,7 +4,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.training import rendered_source
 from vehicle_detection.training.rendered import _LANE, _closest_truncation, _traffic
 
@@ -74,10 +73,3 @@ def test_the_traffic_of_single_scenes_is_varied_and_does_not_overlap():
                 assert far.distance_m - near.distance_m >= (11 if near.kind == "truck" else 7)
     assert {"truck", "van", "sedan"} <= kinds
     assert views == {"rear", "front"}
-
-
-def test_bad_arguments():
-    with pytest.raises(InvalidInputError, match="frames must be an integer at least 1; got 0"):
-        rendered_source(frames=0)
-    with pytest.raises(InvalidInputError, match="random_state must be an integer"):
-        rendered_source(random_state=-1)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from tests.training.trial_cases import SEARCH, SMALL, UNTIMED
-from vehicle_detection.datasets import PatchSet, Split, make_split, split_sequences
+from vehicle_detection.datasets import PatchSet, make_split, split_sequences
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, evaluate_detections
@@ -66,13 +66,6 @@ def test_features_that_exceed_the_memory_fail(patch_set, monkeypatch):
     assert table["status"].tolist() == ["failed"]
     message = table["message"][0]
     assert "features of 96 patches needs about 1 GB, but this machine has 0 GB" in message
-
-
-def test_training_on_one_class_fails(patch_set):
-    split = Split(np.flatnonzero(patch_set.labels), np.flatnonzero(~patch_set.labels))
-    table = compare_configurations(patch_set, [SMALL], splits={"vehicles": split}, options=UNTIMED)
-    assert table["status"].tolist() == ["failed"]
-    assert "labels must hold both classes" in table["message"][0]
 
 
 def test_frames_are_scored_like_the_detector(patch_set, frames, labels):

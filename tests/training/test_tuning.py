@@ -54,12 +54,6 @@ def test_every_configuration_is_tried_with_every_c_split_and_seed(patch_set):
     assert table["trial"].nunique() == 16
 
 
-def test_own_splits_and_presets_by_name(patch_set):
-    split = Split(np.arange(0, 120, 2), np.arange(1, 120, 2))
-    table = compare(patch_set, ["luv-2384"], splits={"mine": split})
-    assert table.loc[0, ["split", "n_features", "configuration"]].tolist() == ["mine", 2384, "luv-2384"]
-
-
 def test_a_configuration_overrides_the_training_options(patch_set):
     configurations = [{**SMALL, "C": 0.5, "positive_weight": 3.0, "mirror": False}, SMALL]
     table = compare(patch_set, configurations, C=[0.1, 0.2])
@@ -120,17 +114,6 @@ def test_a_bad_c_is_a_failed_row(patch_set):
     table = compare(patch_set, [SMALL], C=[-1.0, 1.0])
     assert table["status"].tolist() == ["failed", "ok"]
     assert "C must be a number, greater than 0" in table["message"][0]
-
-
-def test_a_split_that_the_patches_do_not_allow(patch_set):
-    names = [f"a/{number}.png" for number in range(120)]
-    with pytest.raises(InvalidInputError, match="'GTI'"):
-        compare(PatchSet(patch_set.patches, patch_set.labels, names), [SMALL], splits="gti_to_kitti")
-
-
-def test_a_progress_bar_counts_the_rows(patch_set, capsys):
-    compare(patch_set, [SMALL, {"orient": 0}], progress=True)
-    assert "2/2" in capsys.readouterr().err
 
 
 # The store
@@ -359,12 +342,6 @@ def test_folds_cover_all_patches_without_leakage(patch_set, split):
 def test_invalid_arguments_of_search_parameters(patch_set, options, message):
     with pytest.raises(InvalidInputError, match=message):
         search_parameters(patch_set, **{"grid": {"orient": [4]}, "options": UNTIMED, **options})
-
-
-def test_invalid_numbers_of_halving():
-    for wrong in ({"n_folds": 1}, {"factor": 1}, {"n_finalists": -1}, {"n_candidates": 0}):
-        with pytest.raises(InvalidInputError, match=f"{next(iter(wrong))} must be an integer"):
-            Halving(**wrong)
 
 
 def test_a_fold_with_one_class_is_rejected(patch_set):

@@ -183,15 +183,6 @@ def test_false_boxes_in_frames_without_vehicles():
     assert (score.false_per_empty_frame, score.false_per_vehicle_free_frame) == (2.0, 1.5)
 
 
-def test_a_selection_of_frames():
-    fold = fold_of([1.0, 0.5, 0.2, -0.5], [True, False, True, True])
-    part = fold.select({1, 3}, "part")
-    assert (part.frames.name, part.frames.keys, part.source) == ("part", (1, 3), "road")
-    assert part.logits.tolist() == [0.5, -0.5]
-    score = score_fold(part, 0.0)
-    assert (score.frames, score.vehicles, score.precision, score.recall) == (2, 2, 0.0, 0.0)
-
-
 def test_detections_of_any_model():
     seen = []
 
