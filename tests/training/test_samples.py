@@ -19,7 +19,7 @@ def frame(boxes=((30, 30, 90, 70),), ignored=(), shape=(120, 200), source="road"
 
 @given(st.integers(0, 10_000))
 def test_boxes_lie_inside_the_sample_and_have_a_size(seed):
-    sampler = Sampler.of([frame(ignored=[(100, 10, 190, 60)])], SIZE)
+    sampler = Sampler([frame(ignored=[(100, 10, 190, 60)])], SIZE)
     sample = sampler.draw(np.random.default_rng(seed))
     assert sample.image.shape == (SIZE[1], SIZE[0], 3)
     assert sample.image.dtype == np.uint8
@@ -30,7 +30,7 @@ def test_boxes_lie_inside_the_sample_and_have_a_size(seed):
 
 
 def test_a_sample_depends_on_the_seed_alone():
-    sampler = Sampler.of([frame(), frame(boxes=())], SIZE)
+    sampler = Sampler([frame(), frame(boxes=())], SIZE)
     one, again, other = (sampler.draw(np.random.default_rng(seed)) for seed in (5, 5, 6))
     for a, b in zip(one, again):
         np.testing.assert_array_equal(a, b)
@@ -40,7 +40,7 @@ def test_a_sample_depends_on_the_seed_alone():
 def test_drawing_does_not_change_the_frame():
     original = frame()
     before = original.image.copy()
-    sampler = Sampler.of([original], SIZE)
+    sampler = Sampler([original], SIZE)
     for seed in range(10):
         sampler.draw(np.random.default_rng(seed))
     np.testing.assert_array_equal(original.image, before)
@@ -71,18 +71,18 @@ def test_the_visible_fraction_of_a_box_that_the_edge_cuts():
 
 
 def test_frames_with_vehicles_are_drawn_more_often():
-    weights = Sampler.of([frame(boxes=()), frame(), frame(boxes=[(1, 1, 20, 20)] * 6)], SIZE).weights
+    weights = Sampler([frame(boxes=()), frame(), frame(boxes=[(1, 1, 20, 20)] * 6)], SIZE).weights
     assert weights.sum() == pytest.approx(1)
     assert weights[0] < weights[1] < weights[2]
 
 
 def test_a_source_counts_with_the_square_root_of_its_size():
     many = [dataclasses.replace(frame(), source="many") for _ in range(16)]
-    weights = Sampler.of([*many, frame()], SIZE).weights
+    weights = Sampler([*many, frame()], SIZE).weights
     assert weights[:16].sum() == pytest.approx(4 * weights[16])
 
 
 def test_covered_vehicles_become_neither_vehicle_nor_background():
-    sampler = Sampler.of([frame()], SIZE)
+    sampler = Sampler([frame()], SIZE)
     unclear = [sampler.draw(np.random.default_rng(seed)) for seed in range(80)]
     assert any(len(sample.ignored) and not len(sample.boxes) for sample in unclear)

@@ -103,7 +103,8 @@ def fine_tune_network(
     frames = load_training_frames(kept, max_side=_MAX_SIDE)
     if held_out:
         load_training_frames(held_out)  # checks their boxes before the training
-    count = default_steps(len(frames)) if steps is None else check_integer(steps, "steps", low=1)
+    count = min(max(_STEPS_PER_FRAME * len(frames), _MIN_STEPS), _MAX_STEPS)
+    count = count if steps is None else check_integer(steps, "steps", low=1)
     training = NetworkTraining(
         steps=count,
         batch=_BATCH,
@@ -127,11 +128,6 @@ def fine_tune_network(
     if path is not None:
         path.unlink(missing_ok=True)
     return FineTuning(load_content(content), before, after, folds)
-
-
-def default_steps(frames: int) -> int:
-    """Return the steps of a training on so many frames."""
-    return min(max(_STEPS_PER_FRAME * frames, _MIN_STEPS), _MAX_STEPS)
 
 
 def _calibrate(model: NetworkModel, folds: Sequence[FoldDetections]) -> NetworkModel:

@@ -71,12 +71,12 @@ def train_network(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(training.random_state)
         network = copy.deepcopy(initial) if initial is not None else Network()
-    state = _State.start(network.to(place), training)
+    state = _State(network.to(place), training)
     if checkpoint is not None and checkpoint.exists():
         state.load(checkpoint)
     report = on_step or (lambda _, line: log.info(line))
     centers, _ = cell_centers(training.size[1], training.size[0], place)
-    dataset = _Samples(Sampler.of(frames, training.size), training, state.step)
+    dataset = _Samples(Sampler(frames, training.size), training, state.step)
     # On a processor, drawing samples takes a sixth of the time; a process for it would disturb two threads.
     workers = max(1, jobs - 1) if place.type == "cuda" else int(jobs > 2)
     batches = DataLoader(
@@ -148,9 +148,6 @@ class _Samples(Dataset[tuple[Tensor, ...]]):
     def __len__(self) -> int:
         return self._training.steps - self._start
 
-    def __iter__(self) -> Iterator[tuple[Tensor, ...]]:
-        return (self[index] for index in range(len(self)))
-
     def __getitem__(self, index: int) -> tuple[Tensor, ...]:
         first = (self._start + index) * self._training.batch
         numbers = range(first, first + self._training.batch)
@@ -174,16 +171,10 @@ def collate(samples: Sequence[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 class _State:
     """What changes during a training: weights, their moving average, optimizer, number of steps."""
 
-    def __init__(
-        self, network: Network, average: Network, optimizer: torch.optim.Optimizer, training: NetworkTraining
-    ) -> None:
-        self.network, self.average, self.optimizer, self.training = network, average, optimizer, training
-        self.step = 0
-
-    @classmethod
-    def start(cls, network: Network, training: NetworkTraining) -> _State:
-        average = copy.deepcopy(network).eval()
-        network = network.to(memory_format=torch.channels_last).train()
+    def __init__(self, network: Network, training: NetworkTraining) -> None:
+        self.step, self.training = 0, training
+        self.average = copy.deepcopy(network).eval()
+        self.network = network.to(memory_format=torch.channels_last).train()
         if training.frozen_statistics:
             for module in network.modules():
                 if isinstance(module, nn.BatchNorm2d):
@@ -191,7 +182,7 @@ class _State:
         kernels = [each for each in network.parameters() if each.ndim > 1]
         others = [each for each in network.parameters() if each.ndim <= 1]
         groups = [{"params": kernels, "weight_decay": _WEIGHT_DECAY}, {"params": others, "weight_decay": 0.0}]
-        return cls(network, average, torch.optim.AdamW(groups, lr=training.rate, fused=True), training)
+        self.optimizer = torch.optim.AdamW(groups, lr=training.rate, fused=True)
 
     def update(self, images: Tensor, targets: Targets, centers: Tensor) -> tuple[Tensor, Tensor]:
         """Take one step; return its losses."""

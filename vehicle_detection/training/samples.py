@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import functools
 import math
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -44,19 +44,15 @@ class Sample(NamedTuple):
     ignored: Floats  # (M, 4)
 
 
-@dataclass(frozen=True, eq=False)
 class Sampler:
-    """Draws samples of a width and height from frames, each of which has a probability."""
+    """Draws samples of a width and height from frames.
 
-    frames: Sequence[TrainingFrame]
-    size: tuple[int, int]
-    weights: Floats
+    A source is drawn in proportion to the square root of its size, frames with vehicles more often.
+    """
 
-    @classmethod
-    def of(cls, frames: Sequence[TrainingFrame], size: tuple[int, int]) -> Sampler:
-        """Draw a source in proportion to the square root of its size, frames with vehicles more often."""
-        names = [frame.source for frame in frames]
-        counts = {name: names.count(name) for name in set(names)}
+    def __init__(self, frames: Sequence[TrainingFrame], size: tuple[int, int]) -> None:
+        self._frames, self._size = frames, size
+        counts = Counter(frame.source for frame in frames)
         weights = np.array(
             [
                 _SOURCE_WEIGHTS.get(frame.source, 1.0)
@@ -65,15 +61,15 @@ class Sampler:
                 for frame in frames
             ]
         )
-        return cls(frames, size, weights / weights.sum())
+        self.weights = weights / weights.sum()  # probability of each frame
 
     def draw(self, rng: np.random.Generator) -> Sample:
         """Draw one sample; it depends on the generator alone."""
-        frame = self.frames[int(rng.choice(len(self.frames), p=self.weights))]
-        matrix = _random_view(frame, self.size, rng)
-        image = _warp(frame.image, matrix, self.size)
-        boxes, visible = move_boxes(frame.boxes, matrix, self.size)
-        ignored, ignored_visible = move_boxes(frame.ignored, matrix, self.size)
+        frame = self._frames[int(rng.choice(len(self._frames), p=self.weights))]
+        matrix = _random_view(frame, self._size, rng)
+        image = _warp(frame.image, matrix, self._size)
+        boxes, visible = move_boxes(frame.boxes, matrix, self._size)
+        ignored, ignored_visible = move_boxes(frame.ignored, matrix, self._size)
         covered = _cover(image, boxes, rng)
         usable = (visible > MIN_VISIBLE) & (boxes[:, 2] - boxes[:, 0] > MIN_WIDTH) & (covered < _MAX_COVERED)
         unclear = boxes[~usable & (visible > 0)]

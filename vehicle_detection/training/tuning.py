@@ -407,13 +407,15 @@ def compare_classifiers(
     ['naive Bayes', 'naive Bayes', 'tree', 'tree']
     """
     from sklearn.model_selection import cross_validate
+    from sklearn.naive_bayes import GaussianNB
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
+    from sklearn.svm import LinearSVC
 
-    models = _default_classifiers() if classifiers is None else _check_classifiers(classifiers)
-    if params is not None:
-        check_type(params, "params", FeatureParams, "pass FeatureParams() or a preset")
-    chosen = params or FeatureParams()
+    default = {"naive Bayes": GaussianNB(), "linear SVM": LinearSVC(C=DEFAULT_C, random_state=0)}
+    models = _check_classifiers(default if classifiers is None else classifiers)
+    chosen = FeatureParams() if params is None else params
+    check_type(chosen, "params", FeatureParams, "pass FeatureParams() or a preset")
     trials = list(make_splits(patch_set, splits, check_seeds(seeds)))
     evaluator = TrialEvaluator(patch_set, TrialOptions(cache=cache, jobs=jobs, time_search=False))
     for _, _, split in trials:
@@ -430,12 +432,12 @@ def compare_classifiers(
                 error_score="raise",
             )
             for number, (split_name, seed, split) in enumerate(trials):
-                sizes = {"train_size": len(split.train), "test_size": len(split.test)}
-                measured = {key: scores[f"test_{key}"][number] for key in _ERROR_RATES}
-                times = {"fit_seconds": scores["fit_time"], "predict_seconds": scores["score_time"]}
-                seconds = {key: round(float(values[number]), 3) for key, values in times.items()}
-                columns = {"classifier": name, "split": split_name, "seed": seed}
-                rows.append({**columns, **sizes, **measured, **seconds})
+                row = {"classifier": name, "split": split_name, "seed": seed}
+                row |= {"train_size": len(split.train), "test_size": len(split.test)}
+                row |= {key: scores[f"test_{key}"][number] for key in _ERROR_RATES}
+                row["fit_seconds"] = round(float(scores["fit_time"][number]), 3)
+                row["predict_seconds"] = round(float(scores["score_time"][number]), 3)
+                rows.append(row)
             bar.update()
     return make_table(rows)
 
@@ -450,13 +452,6 @@ def _score_classifier(model: Any, X: NDArray[np.float32], y: NDArray[np.int64]) 
     return dict(zip(_ERROR_RATES, (float(1 - wrong.mean()), *rates)))
 
 
-def _default_classifiers() -> dict[str, Any]:
-    from sklearn.naive_bayes import GaussianNB
-    from sklearn.svm import LinearSVC
-
-    return {"naive Bayes": GaussianNB(), "linear SVM": LinearSVC(C=DEFAULT_C, random_state=0)}
-
-
 def _check_classifiers(classifiers: Mapping[str, Any]) -> dict[str, Any]:
     given: object = classifiers
     if not isinstance(given, Mapping) or not given:
@@ -464,11 +459,9 @@ def _check_classifiers(classifiers: Mapping[str, Any]) -> dict[str, Any]:
             "classifiers must map names to estimators of scikit-learn, at least one, such as "
             f"{{'naive Bayes': GaussianNB()}}; got {describe(given)}"
         )
+    needed = ("fit", "predict", "get_params")  # the last one for `sklearn.base.clone`
     for name, model in given.items():
-        # `sklearn.base.clone` needs get_params.
-        if isinstance(model, type) or not all(
-            hasattr(model, each) for each in ("fit", "predict", "get_params")
-        ):
+        if isinstance(model, type) or not all(hasattr(model, each) for each in needed):
             raise InvalidInputError(
                 f"classifiers[{name!r}] must be an estimator with fit, predict and get_params, got "
                 f"{describe(model)}; pass an instance, such as GaussianNB()"

@@ -221,8 +221,8 @@ def score_fold(
     )
 
 
-def _mean(values: NDArray[Any]) -> float:
-    return float(values.mean()) if len(values) else math.nan
+def _mean(values: Sequence[int] | NDArray[Any]) -> float:
+    return float(np.mean(values)) if len(values) else math.nan
 
 
 def _false_without_vehicles(fold: FoldDetections, above: NDArray[np.bool_]) -> dict[str, Any]:
@@ -230,14 +230,9 @@ def _false_without_vehicles(fold: FoldDetections, above: NDArray[np.bool_]) -> d
     labels, false = fold.labels, above & (fold.matches.match < 0) & ~fold.matches.ignored
     counts = Counter(fold.predictions["frame"][row] for row in np.flatnonzero(false).tolist())
     scored = {labels["frame"][row] for row in fold.matches.usable.tolist()}
-    return {
-        "false_per_empty_frame": _mean(
-            np.array([counts[key] for key in fold.frames.keys if not len(labels.rows(key))])
-        ),
-        "false_per_vehicle_free_frame": _mean(
-            np.array([counts[key] for key in fold.frames.keys if key not in scored])
-        ),
-    }
+    empty = [counts[key] for key in fold.frames.keys if not len(labels.rows(key))]
+    vehicle_free = [counts[key] for key in fold.frames.keys if key not in scored]
+    return {"false_per_empty_frame": _mean(empty), "false_per_vehicle_free_frame": _mean(vehicle_free)}
 
 
 def best_threshold(folds: Sequence[FoldDetections]) -> float:
