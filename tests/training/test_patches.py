@@ -225,9 +225,7 @@ def test_invalid_options(patch_set, options, message):
 
 
 def test_invalid_patches(patch_set):
-    with pytest.raises(
-        InvalidInputError, match=r"patch_set must be a PatchSet, got an array .* read one with"
-    ):
+    with pytest.raises(InvalidInputError, match=r"patch_set .*be a PatchSet, got an array .* read one with"):
         train_and_evaluate(patch_set.patches)
     with pytest.raises(InvalidInputError, match="labels must hold both classes"):
         train_and_evaluate(patch_set[patch_set.labels])

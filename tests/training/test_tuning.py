@@ -16,6 +16,7 @@ from vehicle_detection.training import (
     compare_configurations,
     expand_grid,
     pareto_front,
+    parse_grid,
     read_results,
     search_parameters,
 )
@@ -114,6 +115,25 @@ def test_a_bad_c_is_a_failed_row(patch_set):
     table = compare(patch_set, [SMALL], C=[-1.0, 1.0])
     assert table["status"].tolist() == ["failed", "ok"]
     assert "C must be a number, greater than 0" in table["message"][0]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "grid is empty; name at least one option"),
+        ("orient", "grid must look like 'orient=8,9 .* got 'orient'"),
+        ("orient=8, 9", "got 'orient=8,'"),
+        ("=8", "got '=8'"),
+        ("orient=8 orient=9", "grid names orient twice"),
+        ("color=LAB", "grid has the unknown option 'color'"),
+    ],
+)
+def test_the_text_of_a_grid(text, message):
+    grid = parse_grid("orient=8,9 color_space=YCrCb,LAB  hog_channel=ALL,0 C=1e-4,1 mirror=true,no")
+    assert grid["hog_channel"] + grid["C"] + grid["mirror"] == ["ALL", 0, 1e-4, 1, True, False]
+    assert len(expand_grid(grid)) == 32
+    with pytest.raises(InvalidInputError, match=message):
+        parse_grid(text)
 
 
 # The store
