@@ -211,23 +211,6 @@ def test_leakage_is_a_fraction_of_the_test_patches():
 
 
 @pytest.mark.realdata
-def test_the_sizes_of_the_real_splits(real_patches):
-    sequences = split_sequences(real_patches)
-    assert real_patches[sequences.test].counts() == {
-        "Extras": 1014,
-        "GTI": 780,
-        "GTI_Far": 167,
-        "GTI_Left": 182,
-        "GTI_MiddleClose": 84,
-        "GTI_Right": 133,
-        "KITTI_extracted": 1193,
-    }
-    assert_covers(sequences, 17760)
-    assert len(split_random(real_patches, random_state=0).test) == 3552
-    assert len(split_sources(real_patches).train) == 6726
-
-
-@pytest.mark.realdata
 def test_the_real_splits_leak_as_documented(real_patches):
     sequences = split_sequences(real_patches)
     assert split_leakage(real_patches, split_random(real_patches, random_state=0)) > 0.2
@@ -299,9 +282,3 @@ def test_invalid_arguments():
         split_leakage(patches, Split([0], [5]))
     with pytest.raises(InvalidInputError, match=r"patches must be an \(N, 64, 64, 3\) uint8"):
         find_near_duplicates(np.zeros((2, 3)))
-
-
-@pytest.mark.parametrize("split", [split_sequences, split_groups, split_sources])
-def test_splits_need_a_patch_set(split):
-    with pytest.raises(InvalidInputError, match=r"patch_set must be a PatchSet, .*read one with load_train"):
-        split(np.zeros((2, 64, 64, 3), np.uint8))

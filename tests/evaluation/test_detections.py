@@ -150,14 +150,6 @@ def test_the_curve_equals_the_scores_at_every_threshold(trial):
         assert (scores.precision, scores.recall) == (precision[index], recall[index])
 
 
-def test_best_f1_and_its_threshold():
-    # Two true positives with high scores and a false one with a low score: F1 is 1 above the latter.
-    labels = boxes_of((0, 1, CAR), (0, 2, moved(300)))
-    found = boxes_of((0, -1, CAR, 2.0), (0, -1, moved(300), 1.0), (0, -1, moved(900), 0.5))
-    assert evaluate_detections(found, labels).f1 == pytest.approx(4 / 5)
-    assert best_f1(*precision_recall_curve(found, labels)) == (1.0, 1.0)
-
-
 def test_best_f1_without_detections_or_vehicles():
     labels, nothing = boxes_of((0, 1, CAR)), TrackTable([], None, [])
     f1, threshold = best_f1(*precision_recall_curve(nothing, labels))

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.evaluation import evaluate_detections, evaluate_tracks
 from vehicle_detection.formats import read_labels
 from vehicle_detection.images import write_image
 from vehicle_detection.tables import TrackTable
@@ -292,32 +291,6 @@ def test_coco_reader_raises_only_dataset_errors(tmp_path_factory, changes):
         assert isinstance(read_labels(path), TrackTable)
 
 
-@pytest.mark.realdata
-@pytest.mark.parametrize(
-    ("name", "frames", "usable", "shape"),
-    [
-        ("project_clip", 350, 380, (720, 1280)),
-        ("test_video", 38, 76, (720, 1280)),
-        ("test_images", 6, 9, (720, 1280)),
-        ("india", 165, 509, None),
-        ("camvid", 157, 148, (360, 480)),
-        ("indonesia", 79, 242, None),
-    ],
-)
-def test_real_labels(real_data: Path, name, frames, usable, shape):
-    path = real_data / "labels" / f"{name}.csv"
-    labels = read_labels(path, shape=shape)
-    assert len(labels.frame_keys) == frames
-    assert (~labels["ignore"]).sum() == usable
-    scores = evaluate_detections(labels, labels)
-    assert (scores.f1, scores.mean_iou, scores.tp) == (1, 1, usable)
-    if shape is not None:
-        np.testing.assert_array_equal(labels.boxes, read_labels(path).boxes)
-    if name in ("project_clip", "test_video"):
-        tracked = evaluate_tracks(labels, labels)
-        assert (tracked.mota, tracked.jitter, tracked.vehicles) == (1, 0, 2)
-
-
 # --- archives of CVAT, YOLO ---
 
 
@@ -477,13 +450,6 @@ def test_names_of_yolo_classes(tmp_path, names, text, known):
     written(tmp_path / "labels" / "train", rows, "000000.txt")
     labels = read_labels(tmp_path / "labels" / "train", format="yolo", shape=(100, 100))
     assert labels.boxes[:, 0].round().tolist() == ([45, 75] if known else [15, 45, 75])
-
-
-def test_yolo_names_that_cannot_be_read(tmp_path):
-    written(tmp_path, "nc: 3\n", "data.yaml")
-    written(tmp_path, "0 .2 .5 .1 .1\n", "000000.txt")
-    with pytest.raises(DatasetError, match=r"data\.yaml names no class; write them as names"):
-        read_labels(tmp_path, format="yolo", shape=(100, 100))
 
 
 def test_numbers_that_only_python_reads(tmp_path):

@@ -123,16 +123,6 @@ def test_a_frame_rate_adds_the_time(tmp_path, suffix):
         assert read_labels(path).to_pandas().equals(read_labels(without).to_pandas())
 
 
-def test_other_formats_have_no_time(tmp_path):
-    for name in ("t.txt", "t.json"):
-        write_tracks(RESULTS, tmp_path / name, fps=25)
-        write_tracks(RESULTS, tmp_path / f"without_{name}")
-        assert (tmp_path / name).read_bytes() == (tmp_path / f"without_{name}").read_bytes()
-    for results in (RESULTS, TrackTable.from_results(RESULTS)):
-        with pytest.raises(InvalidInputError, match="fps must be a number, greater than 0"):
-            write_tracks(results, tmp_path / "t.csv", fps=0)
-
-
 def test_pandas_reads_the_tables(tmp_path):
     for name in ("tracks.csv", "tracks.parquet", "tracks.jsonl"):
         write_tracks(RESULTS, tmp_path / name)
@@ -313,6 +303,7 @@ def test_an_error_in_the_results_leaves_the_earlier_file(tmp_path, name):
         (RESULTS, {"path": None}, "path must be a file name"),
         (RESULTS, {"path": "missing/t.csv"}, "path needs an existing folder"),
         (RESULTS, {"path": "."}, "path must"),
+        (RESULTS, {"fps": 0}, "fps must be a number, greater than 0"),
         (7, {}, "results must be a list of FrameResult or a TrackTable, got 7"),
         ("rows", {}, "results must be a list"),
         (pd.DataFrame({"frame": [0]}), {}, "TrackTable.from_pandas"),

@@ -7,7 +7,6 @@ from tests.training.trial_cases import SEARCH, SMALL
 from vehicle_detection.datasets import PatchSet, load_frames
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams
-from vehicle_detection.formats import read_labels
 from vehicle_detection.images import write_image
 from vehicle_detection.search import SearchBand, SearchParams
 from vehicle_detection.tables import TrackTable
@@ -126,15 +125,3 @@ def test_invalid_arguments(frames, labels, random_svm):
     ):
         with pytest.raises(InvalidInputError, match=message):
             mine_negatives(images, labels, random_svm, **options)
-
-
-@pytest.mark.realdata
-def test_real_frames_are_mined_outside_their_labels(real_data, random_svm):
-    labels = read_labels(real_data / "labels" / "test_images.csv")
-    frames = load_frames(real_data / "test_images")
-    mined = mine_negatives(frames, labels, random_svm, max_per_frame=30, min_score=0.5)
-    assert 0 < len(mined) <= 180
-    for frame, box in zip(*boxes_of(mined)):
-        boxes = labels.boxes[labels.rows(frame)]
-        inside = np.minimum(boxes[:, 2:], box[2:]) - np.maximum(boxes[:, :2], box[:2])
-        assert not (inside > 1).all(axis=1).any()
