@@ -1,12 +1,9 @@
 """Score detections against labelled frames: precision, recall, F1, average precision.
 
-Labels marked ``ignore`` are not scored. An unmatched prediction is ignored, so that it counts neither as
-right nor as wrong, if its center lies in a region (``ignore`` with track -1), or if it overlaps an ignored
-box by at least the IoU in use. If one ignored box covers several vehicles, such as touching cars in a class
-mask, no single prediction reaches that IoU: with ``ignored_as_regions`` a prediction is also ignored if half
-of it lies in an ignored box.
-
-A ratio whose denominator is 0 is NaN: ``n/a`` in a summary, None in ``to_dict``.
+Labels marked ``ignore`` are not scored. An unmatched prediction counts neither as right nor as wrong if its
+center lies in a region (``ignore`` with track -1), or if it overlaps an ignored box by at least the IoU in
+use; with ``ignored_as_regions`` also if half of it lies in an ignored box. A ratio whose denominator is 0 is
+NaN: ``n/a`` in a summary, None in ``to_dict``.
 """
 
 from __future__ import annotations

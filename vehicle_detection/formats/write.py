@@ -388,13 +388,7 @@ def write_tracks(
     ``frame`` counts from 0, the first processed frame; boxes are half-open pixels with two decimals.
     Unknown values are empty in CSV and null elsewhere. The score is the log-odds above the threshold, the
     confidence a calibrated probability; speeds are relative to the camera. Detections of images have the
-    columns up to ``score``, and ``confidence``.
-
-    MOT files count frames and pixels from 1, as the MOTChallenge tools do, and hold width and height. A COCO
-    file is a data set; for ``COCO.loadRes`` of pycocotools, use `write_labels`. The archive for CVAT holds
-    labels to correct, without scores: ``gt/gt.txt`` with frames from 1 and pixels from 0, and
-    ``gt/labels.txt``. A YOLO folder has ``labels/000000.txt`` for each frame, with class, center and size as
-    fractions of the frame, confidence and track.
+    columns up to ``score``, and ``confidence``. The archive for CVAT holds labels to correct, without scores.
 
     Examples
     --------
@@ -462,23 +456,9 @@ def write_labels(
 
     Notes
     -----
-    No format but KITTI, YOLO (tracks of labels) and the archive for CVAT (scores) loses a box's score, track
-    or ``ignore`` without an error. What else each cannot hold:
-
-    - CSV, JSON Lines, Parquet: frames without boxes. CSV also reads names that are all whole numbers as
-      numbers, and rejects them.
-    - MOT: frames without boxes, named frames (an error), predictions marked ``ignore`` (an error), occlusion
-      and truncation (the file has an estimate of the visible fraction), distance and speed.
-    - COCO: occlusion and truncation. Ignored boxes are crowds, which pycocotools ignores as
-      `evaluate_detections` does with ``ignored_as_regions=True``.
-    - COCO results: the same, and predictions marked ``ignore`` (an error).
-    - YOLO: ignored boxes (an error), boxes that extend beyond `shape` by over 1 px (an error), suffixes of
-      file names, distance and speed. Scores become confidences.
-    - KITTI: numbered frames (an error), suffixes of images' names, tracks, distance and speed. Ignored
-      boxes become regions, and `read_labels` ignores labels that are narrow, hidden or truncated.
-
-    Without `truth`, the id of a COCO image is its frame number plus 1 or a hash of its file name, so that
-    labels and predictions written separately agree.
+    The page on files lists what each format holds. No format but KITTI, YOLO (tracks of labels) and the
+    archive for CVAT (scores) loses a box's score, track or ``ignore`` without an error. Tables and MOT files
+    do not list frames without boxes. Ignored boxes become crowds in COCO and regions in KITTI.
 
     Examples
     --------
