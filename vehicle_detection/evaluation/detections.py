@@ -89,37 +89,21 @@ class SizeScores:
 
 @dataclass(frozen=True)
 class DetectionScores(Scores):
-    """Result of `evaluate_detections`.
+    """Result of `evaluate_detections`."""
 
-    Attributes
-    ----------
-    frames, iou
-        Number of evaluated frames, and smallest IoU of a match.
-    tp, fp, fn, ignored
-        Numbers of vehicles found, false detections, vehicles missed, and ignored detections.
-    precision, recall, f1
-        ``tp / (tp + fp)``, ``tp / (tp + fn)`` and ``2 tp / (2 tp + fp + fn)``.
-    average_precision
-        Area under the precision-recall curve with monotonic precision (PASCAL VOC since 2010).
-    false_positives_per_frame, mean_iou
-        ``fp / frames``, and the mean IoU of the matched pairs.
-    by_size
-        The same for ``"small"`` (under 64 px wide), ``"medium"`` (under 128 px) and ``"large"`` vehicles.
-    """
-
-    frames: int
-    iou: float
-    tp: int
-    fp: int
-    fn: int
-    ignored: int
-    precision: float
-    recall: float
-    f1: float
-    average_precision: float
-    false_positives_per_frame: float
-    mean_iou: float
-    by_size: dict[str, SizeScores]
+    frames: int  #: number of evaluated frames
+    iou: float  #: smallest IoU of a match
+    tp: int  #: vehicles found
+    fp: int  #: false detections
+    fn: int  #: vehicles missed
+    ignored: int  #: ignored detections
+    precision: float  #: ``tp / (tp + fp)``
+    recall: float  #: ``tp / (tp + fn)``
+    f1: float  #: ``2 tp / (2 tp + fp + fn)``
+    average_precision: float  #: area under the monotonic precision-recall curve (PASCAL VOC since 2010)
+    false_positives_per_frame: float  #: ``fp / frames``
+    mean_iou: float  #: of the matched pairs
+    by_size: dict[str, SizeScores]  #: of ``"small"`` (below 64 px), ``"medium"`` (below 128), ``"large"``
 
     def summary(self) -> str:
         """Return the scores as a few aligned lines."""

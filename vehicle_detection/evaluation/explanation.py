@@ -42,22 +42,6 @@ _ANY_SCORE = -1e6
 class Explanation:
     """How the score of a box comes about.
 
-    Attributes
-    ----------
-    box, found
-        ``(4,)`` the explained box: the found vehicle that overlaps the given box, if `found`; else the given
-        box itself.
-    window
-        ``(4,)`` rectangle of the window's cells in pixels, which may extend beyond the image.
-    cells
-        ``(rows, columns)`` share of each cell in the score, positive where it speaks for a vehicle.
-    terms
-        Named amounts whose sum is `margin`: ``"cells"``, the sum of `cells`; for classifiers of patches
-        ``"bias"`` and ``"color histogram"``, which has no position; for networks ``"rest"``, what cells share
-        and what lies outside them.
-    score
-        Score of the found vehicle; for classifiers of patches that of the window. None if it is not found.
-
     Examples
     --------
     >>> from vehicle_detection import render_scene
@@ -68,12 +52,14 @@ class Explanation:
     (True, ['cells', 'rest'], (6, 6))
     """
 
-    box: Floats
+    box: Floats  #: ``(4,)`` the found vehicle that overlaps the given box, if `found`; else the given box
     found: bool
-    window: Floats
-    cells: Floats
+    window: Floats  #: ``(4,)`` rectangle of the window's cells in pixels, which may extend beyond the image
+    cells: Floats  #: ``(rows, columns)`` share of each cell in the score, above 0 if it supports a vehicle
+    #: Amounts whose sum is `margin`: ``"cells"``, the sum of `cells`; for classifiers of patches ``"bias"``
+    #: and ``"color histogram"``, which has no position; for networks ``"rest"``.
     terms: Mapping[str, float]
-    score: float | None
+    score: float | None  #: of the vehicle; for classifiers of patches of the window; None if not found
 
     @property
     def margin(self) -> float:

@@ -21,55 +21,30 @@ from vehicle_detection.tables import NO_TRACK, FrameKey, TrackTable
 
 @dataclass(frozen=True)
 class TrackScores(Scores):
-    """Result of `evaluate_tracks`.
+    """Result of `evaluate_tracks`: counts of boxes are summed over the frames, as in `DetectionScores`."""
 
-    Attributes
-    ----------
-    frames, iou, precision, recall, f1, mean_iou
-        As in `DetectionScores`.
-    vehicles, tracks
-        Number of labelled vehicles, and of predicted tracks with a box that is not ignored.
-    tp, fp, fn, ignored
-        Numbers of boxes on a vehicle, boxes on none, vehicles without a box, and ignored boxes, summed over
-        the frames.
-    jitter
-        Mean change of the four edge errors of a matched box from one frame to the next, in pixels.
-    hota, deta, assa, loca
-        Higher order tracking accuracy, with its parts for detection, association and localization: means
-        over the IoU thresholds 0.05, 0.1, ..., 0.95; `iou` only decides which boxes are ignored. NaN without
-        any box.
-    mota
-        ``1 - (fn + fp + id_switches) / (tp + fn)``; at most 1, and below 0 if errors outnumber vehicles.
-    idf1
-        F1 of the boxes under the best one-to-one assignment of tracks to vehicles over the whole clip.
-    id_switches, fragmentations
-        Number of times a vehicle is matched by another track than last, and is lost and found again.
-    longest_false_positive_run
-        Largest number of consecutive evaluated frames in which one track is a false positive.
-    """
-
-    frames: int
-    iou: float
-    vehicles: int
-    tracks: int
-    tp: int
-    fp: int
-    fn: int
-    ignored: int
-    precision: float
-    recall: float
-    f1: float
-    mean_iou: float
-    jitter: float
-    hota: float
-    deta: float
-    assa: float
-    loca: float
-    mota: float
-    idf1: float
-    id_switches: int
-    fragmentations: int
-    longest_false_positive_run: int
+    frames: int  #: number of evaluated frames
+    iou: float  #: smallest IoU of a match
+    vehicles: int  #: labelled vehicles
+    tracks: int  #: predicted tracks with a box that is not ignored
+    tp: int  #: boxes on a vehicle
+    fp: int  #: boxes on none
+    fn: int  #: vehicles without a box
+    ignored: int  #: ignored boxes
+    precision: float  #: of the boxes
+    recall: float  #: of the boxes
+    f1: float  #: of the boxes
+    mean_iou: float  #: of the matched pairs
+    jitter: float  #: mean change of the four edge errors of a matched box between two frames (px)
+    hota: float  #: higher order tracking accuracy, mean over the IoU thresholds 0.05, 0.1, ..., 0.95
+    deta: float  #: its part for detection
+    assa: float  #: its part for association
+    loca: float  #: its part for localization
+    mota: float  #: ``1 - (fn + fp + id_switches) / (tp + fn)``; at most 1, and may be below 0
+    idf1: float  #: F1 of the boxes under the best one-to-one assignment of tracks to vehicles
+    id_switches: int  #: times that a vehicle is matched by another track than last
+    fragmentations: int  #: times that a vehicle is lost and found again
+    longest_false_positive_run: int  #: most consecutive frames in which one track is a false positive
 
     def summary(self) -> str:
         """Return the scores as a few aligned lines."""
