@@ -46,8 +46,6 @@ def load_frames(folder: str | os.PathLike[str]) -> FrameSet:
 
     ``frames.names[i]`` is the file name that labels refer to; ``frames[i]`` reads the image.
 
-    Examples
-    --------
     >>> load_frames("missing")
     Traceback (most recent call last):
     ...

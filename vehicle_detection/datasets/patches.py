@@ -207,8 +207,6 @@ def load_training_patches(
     `vehicles` and `non_vehicles` are a folder or zip file each, such as `fetch_patches` returns. Options: see
     `load_patches`.
 
-    Examples
-    --------
     >>> load_training_patches("v.zip", "n.zip")  # doctest: +ELLIPSIS
     Traceback (most recent call last):
     ...

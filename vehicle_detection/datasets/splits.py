@@ -67,8 +67,6 @@ def split_random(
     `split_groups`, `split_sequences` or `split_sources` as well. The patches are a set or its ``(N,)``
     labels; `test_size` is the fraction of test patches, in (0, 1), rounded up to whole patches.
 
-    Examples
-    --------
     >>> split_random([1, 1, 1, 1, 1, 0, 0, 0, 0, 0], random_state=0)
     Split(train: 8 rows, test: 2 rows)
     """
@@ -97,8 +95,6 @@ def split_sequences(patch_set: PatchSet, *, test_size: float = 0.2) -> Split:
     a random split, 0.02 for `split_sources` and 0 for `split_groups`. `test_size` is the fraction of each
     folder to test on, in (0, 1), rounded; a folder of two or more patches gives at least one to each part.
 
-    Examples
-    --------
     >>> names = [f"vehicles/KITTI/{number}.png" for number in (10, 9, 8, 7, 11)]
     >>> split_sequences(PatchSet(np.zeros((5, 64, 64, 3), np.uint8), [1] * 5, names)).test
     array([4])
@@ -180,8 +176,6 @@ def split_sources(
     so on. Rows of other sources are left out. The reverse of the default is ``train=("KITTI", "Extras"),
     test=("GTI",)``.
 
-    Examples
-    --------
     >>> names = ["v/GTI_Far/1.png", "n/GTI/1.png", "v/KITTI_extracted/1.png", "n/Extras/1.png"]
     >>> split_sources(PatchSet(np.zeros((4, 64, 64, 3), np.uint8), [1, 0, 1, 0], names)).test
     array([2, 3])
@@ -237,8 +231,6 @@ def find_near_duplicates(
     Returns ``(M, 2)`` row numbers: each patch that has a near duplicate, ascending, and the most similar
     patch.
 
-    Examples
-    --------
     >>> patches = np.random.default_rng(0).integers(0, 256, (4, 64, 64, 3), np.uint8)
     >>> patches[3] = patches[1] // 2
     >>> find_near_duplicates(patches)
@@ -301,8 +293,6 @@ def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95)
 
     It is 0 for a split by `split_groups` at this threshold (see `find_near_duplicates`) or a lower one.
 
-    Examples
-    --------
     >>> patches = np.random.default_rng(0).integers(0, 256, (4, 64, 64, 3), np.uint8)
     >>> patches[3] = patches[0]
     >>> patch_set = PatchSet(patches, [1, 1, 0, 0], ["1.png", "2.png", "3.png", "4.png"])

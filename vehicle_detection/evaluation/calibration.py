@@ -97,8 +97,6 @@ def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int 
     the samples (Naeini et al., "Obtaining well calibrated probabilities using Bayesian binning", 2015).
     It is in [0, 1]; 0 is perfect. The labels are 0 or 1 or bool.
 
-    Examples
-    --------
     >>> round(calibration_error([0.9, 0.9, 0.1, 0.1], [1, 1, 0, 1]), 3)
     0.25
     """

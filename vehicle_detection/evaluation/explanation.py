@@ -42,8 +42,6 @@ _ANY_SCORE = -1e6
 class Explanation:
     """How the score of a box comes about.
 
-    Examples
-    --------
     >>> from vehicle_detection import render_scene
     >>> from vehicle_detection.scenes import SceneVehicle
     >>> scene = render_scene(shape=(360, 640), vehicles=[SceneVehicle(distance_m=15.0)], random_state=1)

@@ -334,8 +334,6 @@ def open_tracks(
     far. The file appears when the ``with`` block ends without an error; otherwise an existing file is kept.
     Options: see `write_tracks`.
 
-    Examples
-    --------
     >>> import tempfile
     >>> from pathlib import Path
     >>> from vehicle_detection import Detections, FrameResult, Tracker

@@ -35,31 +35,19 @@ DEFAULT_C = 1e-4
 class TrainingOptions(Checked):
     """Options of the training of a patch classifier.
 
-    Attributes
-    ----------
-    C
-        Inverse regularization strength. Small values generalize better to other sequences.
-    mirror, gamma
-        Add the mirror image of each patch, with a brightness jitter of exponents from ``exp(-gamma)`` to
-        ``exp(gamma)``.
-    degraded
-        Weight, in [0, 1], of two more copies of each patch, one blurred, the other also desaturated and
-        compressed, which help on images of other cameras. 0 omits them.
-    positive_weight
-        Cost of a misclassified vehicle, in those of a misclassified non-vehicle.
-    random_state
-        Seed of the solver.
-
-    Examples
-    --------
     >>> TrainingOptions(C=0.01, degraded=0.05).copy_weights
     (1.0, 1.0, 0.05, 0.05)
     """
 
+    #: Inverse regularization strength. Small values generalize better to other sequences.
     C: float = number(DEFAULT_C, above=0, high=1e12)
+    #: Add the mirror image of each patch, with brightness exponents from ``exp(-gamma)`` to ``exp(gamma)``.
     mirror: bool = flag(True)
     gamma: float = number(0.0, low=0, high=2)
+    #: Weight, in [0, 1], of two more copies of each patch, one blurred, the other also desaturated and
+    #: compressed, which help on images of other cameras. 0 omits them.
     degraded: float = number(0.0, low=0, high=1)
+    #: Cost of a misclassified vehicle, in those of a misclassified non-vehicle.
     positive_weight: float = number(1.0, above=0, high=1e6)
     random_state: int = integer(0, low=0, high=2**32 - 1)
 

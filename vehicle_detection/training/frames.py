@@ -31,8 +31,6 @@ log = logging.getLogger(__name__)
 class FrameDataset:
     """Labelled frames of one camera or country: a name, and one or more sets.
 
-    Examples
-    --------
     >>> from vehicle_detection.tables import TrackTable
     >>> labels = TrackTable([0], None, [[9, 9, 60, 50]])
     >>> road = LabelledFrames("road", [np.zeros((90, 120, 3), np.uint8)], labels)

@@ -25,8 +25,6 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     The transformer has no state and works without `fit`. It ignores the gains, which only `train_classifier`
     uses. It passes scikit-learn's estimator checks that do not need tables of numbers as input.
 
-    Examples
-    --------
     >>> from sklearn.pipeline import make_pipeline
     >>> from sklearn.preprocessing import StandardScaler
     >>> pipeline = make_pipeline(PatchFeatures(color_space="LUV", spatial_feat=False), StandardScaler())
@@ -88,8 +86,6 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 def to_pipeline(classifier: VehicleClassifier) -> Pipeline:
     """Convert a model with one template to a fitted pipeline: `PatchFeatures`, `StandardScaler`, `LinearSVC`.
 
-    Examples
-    --------
     >>> from vehicle_detection import load_classifier
     >>> list(to_pipeline(load_classifier()).named_steps)
     ['features', 'scaler', 'svm']

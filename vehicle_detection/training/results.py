@@ -76,8 +76,6 @@ def pareto_front(table: DataFrame, quality: str = "accuracy", cost: str = "searc
     Returns the selected rows, cheapest first, with their index. The columns are numeric: a higher `quality`
     and a lower `cost` are better. Rows without either are left out; of equal rows the first one is kept.
 
-    Examples
-    --------
     >>> import pandas as pd
     >>> table = pd.DataFrame({"accuracy": [0.9, 0.8, 0.95], "search_ms": [5, 9, 12]})
     >>> pareto_front(table)
@@ -117,8 +115,6 @@ def read_results(path: str | os.PathLike[str]) -> DataFrame:
     NaN marks a missing value. An incomplete last line is left out, and so is the second row of a trial that
     two runs have measured at the same time; another damaged line raises a `DatasetError`.
 
-    Examples
-    --------
     >>> import tempfile
     >>> import pandas as pd
     >>> table = pd.DataFrame({"configuration": ["a"], "accuracy": [0.98]})

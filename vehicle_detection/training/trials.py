@@ -197,30 +197,19 @@ _TIMED_RUNS = 15
 class TrialOptions:
     """What each trial measures besides the accuracy on patches, and its resources.
 
-    Attributes
-    ----------
-    frames
-        Sets of labelled frames of different names, on which classifiers are evaluated without tracking.
-    search_params, region_params
-        Parameters of the detector on these frames. The search is also timed with `search_params`.
-    time_search
-        Measure the time of the fast search of a 1280x720 frame on one core.
-    cache, jobs
-        Folder that keeps features between runs, or a `FeatureCache` of the same patches; and threads of the
-        feature extraction.
-
-    Examples
-    --------
     >>> TrialOptions(time_search=False).frame_sets
     ()
     """
 
+    #: Sets of labelled frames of different names, on which classifiers are evaluated without tracking.
     frames: LabelledFrames | Sequence[LabelledFrames] | None = None
     search_params: SearchParams = dataclasses.field(default_factory=SearchParams.preset)
     region_params: RegionParams = dataclasses.field(default_factory=RegionParams)
+    #: Measure the time of the fast search of a 1280x720 frame with `search_params` on one core.
     time_search: bool = True
+    #: Folder that keeps features between runs, or a `FeatureCache` of the same patches.
     cache: FeatureCache | str | os.PathLike[str] | None = None
-    jobs: int | None = None
+    jobs: int | None = None  #: threads of the feature extraction
 
     def __post_init__(self) -> None:
         if self.cache is not None and not isinstance(self.cache, FeatureCache):
