@@ -8,16 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.evaluation.cases import CAR, boxes_of, moved
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tables import LABEL_COLUMNS, TRACK_COLUMNS, TrackTable
 
-CAR = (0.0, 0.0, 100.0, 60.0)
 PRESENCE = st.lists(st.sets(st.integers(1, 4)), max_size=40)
-
-
-def moved(dx):
-    return (CAR[0] + dx, CAR[1], CAR[2] + dx, CAR[3])
 
 
 def track(number, box=CAR, **values):
@@ -28,14 +24,8 @@ def result(index, *tracks, time=None):
     return SimpleNamespace(index=index, time=time, tracks=tracks)
 
 
-def table_of(*rows, **columns):
-    """Table from (frame, track, box) or (frame, track, box, score) rows."""
-    scores = [row[3] for row in rows] if rows and len(rows[0]) == 4 else None
-    return TrackTable(*([row[i] for row in rows] for i in range(3)), **{"score": scores, **columns})
-
-
 def test_rows_of_a_frame_and_frames_without_boxes():
-    labels = table_of((2, 1, CAR), (0, 1, moved(5)), (2, 3, moved(300)), frame_keys=(0, 1, 2, 3))
+    labels = boxes_of((2, 1, CAR), (0, 1, moved(5)), (2, 3, moved(300)), frame_keys=(0, 1, 2, 3))
     assert (len(labels), labels.frame_keys) == (3, (0, 1, 2, 3))
     assert labels.rows(2).tolist() == [0, 2]
     assert labels.frame(2)["track_id"].tolist() == [1, 3]
@@ -48,7 +38,7 @@ def test_rows_of_a_frame_and_frames_without_boxes():
 
 def test_frame_names_are_sorted_by_their_numbers():
     names = ("f10.png", "f2.png", "a.png")
-    assert table_of(*((name, -1, CAR) for name in names)).frame_keys == ("a.png", "f2.png", "f10.png")
+    assert boxes_of(*((name, -1, CAR) for name in names)).frame_keys == ("a.png", "f2.png", "f10.png")
     assert all(type(key) is int for key in TrackTable(np.arange(2), None, [CAR, CAR]).frame_keys)
     assert TrackTable(np.array(["b", "a"]), None, [CAR, CAR]).frame_keys == ("a", "b")
 
@@ -196,14 +186,14 @@ def test_frames_that_cannot_be_appended(arguments, message):
 
 def test_only_tables_that_were_empty_grow():
     with pytest.raises(InvalidInputError, match=r"start with TrackTable\(\)"):
-        table_of((0, 1, CAR)).append(1)
+        boxes_of((0, 1, CAR)).append(1)
 
 
 # --- pandas ---
 
 
 def test_a_table_of_pandas_is_taken_back_whole():
-    found = table_of(
+    found = boxes_of(
         (2, 1, CAR, 0.5),
         (0, -1, moved(5), 1.5),
         occluded=[2, 0],
@@ -212,7 +202,7 @@ def test_a_table_of_pandas_is_taken_back_whole():
         distance_m=[31.5, math.nan],
     )
     pd.testing.assert_frame_equal(TrackTable.from_pandas(found.to_pandas()).to_pandas(), found.to_pandas())
-    labels = table_of(("a", 1, CAR), ("b", -1, CAR))
+    labels = boxes_of(("a", 1, CAR), ("b", -1, CAR))
     again = TrackTable.from_pandas(labels.to_pandas())
     assert (again["frame"].tolist(), again.columns) == (["a", "b"], labels.columns)
     assert "<table" in found._repr_html_()

@@ -1,7 +1,7 @@
-import imageio_ffmpeg
 import numpy as np
 import pytest
 
+from tests.video.clips import write_clip
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.scenes import render_drive
@@ -28,12 +28,7 @@ def test_labels_may_name_the_images_without_their_suffix():
 
 def test_labelled_frames_of_a_video(tmp_path):
     drive = render_drive(frames=7, shape=(96, 160))
-    path = tmp_path / "drive.mp4"
-    writer = imageio_ffmpeg.write_frames(str(path), (160, 96), fps=25, macro_block_size=1)
-    writer.send(None)
-    for scene in drive:
-        writer.send(scene.image.tobytes())
-    writer.close()
+    path = write_clip(tmp_path / "drive.mp4", [scene.image for scene in drive])
     taken = LabelledFrames.from_video(path, LABELS, every=3, horizon=0.5)
     assert (taken.name, taken.keys, taken.horizon) == ("drive", (0, 3, 6), 0.5)
     assert set(taken.labels["frame"].tolist()) == {0}

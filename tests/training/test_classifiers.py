@@ -19,21 +19,16 @@ PARAMS = FeatureParams(**SMALL)
 def test_the_scores_are_those_of_a_scaler_and_the_classifier(patch_set):
     models = {"bayes": GaussianNB(), "tree": DecisionTreeClassifier(random_state=0)}
     table = compare_classifiers(patch_set, models, params=PARAMS, splits="random", seeds=(0, 1))
-    assert table[["classifier", "seed"]].to_numpy().tolist() == [
-        ["bayes", 0],
-        ["bayes", 1],
-        ["tree", 0],
-        ["tree", 1],
+    assert [*zip(table["classifier"], table["seed"])] == [
+        ("bayes", 0),
+        ("bayes", 1),
+        ("tree", 0),
+        ("tree", 1),
     ]
     for row in table.itertuples():
         split = make_split(patch_set, "random", random_state=row.seed)
-        (X, X_test), (y, y_test) = (
-            [of(patch_set, rows) for rows in split]
-            for of in (
-                lambda patches, rows: extract_features(patches.patches[rows], PARAMS),
-                lambda patches, rows: patches.labels[rows].astype(int),
-            )
-        )
+        X, X_test = (extract_features(patch_set.patches[rows], PARAMS) for rows in split)
+        y, y_test = (patch_set.labels[rows].astype(int) for rows in split)
         reference = make_pipeline(StandardScaler(), models[row.classifier]).fit(X, y)
         wrong = reference.predict(X_test) != y_test
         assert row.accuracy == pytest.approx(1 - wrong.mean())

@@ -1,6 +1,5 @@
 import dataclasses
 
-import imageio_ffmpeg
 import numpy as np
 import pytest
 
@@ -71,13 +70,7 @@ def test_frames_of_a_video_are_sampled_at_the_clip_rate(tmp_path):
         (tmp_path / name).mkdir()
     drive = render_drive(frames=20, shape=(96, 160), fps=10)
     drive.write_labels(tmp_path / "labels" / "drive.csv")
-    writer = imageio_ffmpeg.write_frames(
-        str(tmp_path / "videos" / "drive.mp4"), (160, 96), fps=10, macro_block_size=1
-    )
-    writer.send(None)
-    for scene in drive:
-        writer.send(scene.image.tobytes())
-    writer.close()
+    write_clip(tmp_path / "videos" / "drive.mp4", [scene.image for scene in drive], fps=10)
     (source,) = find_sources(tmp_path, clip_rate=2.0)
     assert (source.name, source.sets[0].keys) == ("drive", (0, 5, 10, 15))
     (source,) = find_sources(tmp_path)

@@ -163,17 +163,10 @@ def test_rows_of_other_patches_splits_and_frames_are_not_used(patch_set, frames,
     changed = PatchSet(patch_set.patches[:, ::-1].copy(), patch_set.labels, patch_set.names)
     on_frames = TrialOptions(frames=frames, time_search=False)
     searched = TrialOptions(frames=frames, search_params=SEARCH, time_search=False)
-    for number, (patches, options) in enumerate(
-        [
-            (changed, {}),
-            (patch_set, {"splits": {"mine": Split([0, 119], [1, 118])}}),
-            (patch_set, {"options": on_frames}),
-            (patch_set, {"options": searched}),
-            (patch_set, {"options": TrialOptions()}),
-        ],
-        start=2,
-    ):
-        compare(patches, [SMALL], store=store, **options)
+    own_split = {"splits": {"mine": Split([0, 119], [1, 118])}}
+    others = [{"options": each} for each in (on_frames, searched, TrialOptions())]
+    for number, options in enumerate([{}, own_split, *others], start=2):
+        compare(changed if number == 2 else patch_set, [SMALL], store=store, **options)
         assert len(tried) == number
     compare(patch_set, [SMALL], store=store)
     assert len(tried) == 6
@@ -253,14 +246,11 @@ def test_halving_keeps_the_better_and_measures_the_best_in_full(patch_set, frame
 
 def larger(patch_set, times):
     """The patches several times, each copy a little brighter."""
-    copies = [
-        PatchSet(
-            (patch_set.patches // 2 + 10 * number).astype(np.uint8),
-            patch_set.labels,
-            [name.replace("/", f"/{number}_", 1) for name in patch_set.names],
-        )
-        for number in range(times)
-    ]
+    copies = []
+    for number in range(times):
+        names = [name.replace("/", f"/{number}_", 1) for name in patch_set.names]
+        brighter = (patch_set.patches // 2 + 10 * number).astype(np.uint8)
+        copies.append(PatchSet(brighter, patch_set.labels, names))
     return PatchSet.concatenate(copies)
 
 
@@ -277,11 +267,8 @@ def test_later_rounds_use_fewer_configurations_and_more_patches(patch_set):
 
 def test_candidates_are_drawn_at_random(patch_set):
     grid = {**SMALL_GRID, "C": [10.0**power for power in range(-8, 2)]}
-    options = {
-        "split": "random",
-        "halving": Halving(n_candidates=3, n_finalists=1, n_folds=2),
-        "options": UNTIMED,
-    }
+    halving = Halving(n_candidates=3, n_finalists=1, n_folds=2)
+    options = {"split": "random", "halving": halving, "options": UNTIMED}
     drawn = []
     for seed in (0, 0, 1):
         table = search_parameters(patch_set, grid, random_state=seed, **options)
