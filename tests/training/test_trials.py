@@ -91,7 +91,7 @@ def test_invalid_options(patch_set, frames):
         TrialOptions(frames=[3])
     with pytest.raises(InvalidInputError, match="frames must have different names"):
         TrialOptions(frames=[frames, frames])
-    with pytest.raises(InvalidInputError, match="patch_set must be a PatchSet with patches, got an array"):
+    with pytest.raises(InvalidInputError, match="patch_set must be a PatchSet, got an array"):
         compare_configurations(patch_set.patches, [SMALL])
     other = FeatureCache(np.zeros((1, 64, 64, 3), np.uint8))
     with pytest.raises(InvalidInputError, match="cache must be a FeatureCache of the patches"):

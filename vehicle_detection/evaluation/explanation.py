@@ -119,22 +119,16 @@ def explain(detector: Detector | VehicleDetector, image: NDArray[np.uint8], box:
     return _explain_classifier(detector, model, frame, boxes[0])
 
 
-def _best_overlap(box: Floats, boxes: Floats, min_iou: float) -> int | None:
-    """Row of the box with the largest IoU; None if all are below `min_iou`."""
-    overlaps = iou_matrix(box[None], boxes)[0]
-    best = int(np.argmax(overlaps)) if len(boxes) else 0
-    return best if len(boxes) and overlaps[best] >= min_iou else None
-
-
 def _explain_network(
     detector: Detector, model: NetworkModel, image: NDArray[np.uint8], box: Floats
 ) -> Explanation:
     params: Any = detector.search_params
     vehicles = detector.search(image).vehicles
     assert vehicles is not None
-    row = _best_overlap(box, vehicles.boxes, _MIN_IOU)
-    score = None if row is None else float(vehicles.scores[row])
-    box = box if row is None else vehicles.boxes[row].astype(np.float64)
+    overlaps, score = iou_matrix(box[None], vehicles.boxes)[0], None
+    if overlaps.max(initial=0) >= _MIN_IOU:
+        row = int(np.argmax(overlaps))
+        box, score = vehicles.boxes[row].astype(np.float64), float(vehicles.scores[row])
     context = _CONTEXT * (box[2:] - box[:2])
     window = np.concatenate([box[:2] - context, box[2:] + context])
     # OpenVINO would compile the graph for each size.

@@ -62,7 +62,7 @@ def _round(record: Record) -> Record:
     }
 
 
-def track_records(result: Any, columns: Sequence[str] = TRACK_COLUMNS) -> list[Record]:
+def track_records(result: Any) -> list[Record]:
     """Return the rounded rows of the shown tracks of a frame's result."""
     if not is_result(result):
         raise InvalidInputError(
@@ -73,7 +73,7 @@ def track_records(result: Any, columns: Sequence[str] = TRACK_COLUMNS) -> list[R
     for track in shown_tracks(result.tracks):
         record: Record = {"frame": int(result.index), "track_id": int(track.id)}
         record |= zip(CORNERS, map(float, track.box))
-        for name in columns[6:]:
+        for name in TRACK_COLUMNS[6:]:
             value = getattr(track, name, None)
             record[name] = None if value is None or math.isnan(value) else float(value)
         records.append(_round(record))

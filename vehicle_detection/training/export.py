@@ -42,10 +42,21 @@ def export_network(
     import onnx
 
     with tempfile.TemporaryDirectory() as folder:
-        plain, prepared, small = (
-            Path(folder) / name for name in ("plain.onnx", "prepared.onnx", "int8.onnx")
-        )
-        _export(network, plain)
+        names = ("plain.onnx", "prepared.onnx", "int8.onnx")
+        plain, prepared, small = (Path(folder) / name for name in names)
+        width, height = _CALIBRATION_SIZE
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the exporter, about sizes that are traced as constants
+            torch.onnx.export(
+                Deployed(network.cpu()).eval(),
+                (torch.zeros(1, height, width, 3),),
+                plain,
+                input_names=["image"],
+                output_names=["boxes"],
+                dynamic_axes={"image": {1: "height", 2: "width"}, "boxes": {2: "cells"}},
+                opset_version=_OPSET,
+                dynamo=False,
+            )
         if quantize:
             _quantize(plain, prepared, small, frames)
         model = onnx.load(small if quantize else plain)
@@ -65,23 +76,6 @@ def set_metadata(content: bytes, params: Mapping[str, Any], metadata: Mapping[st
     for key, value in ((METADATA_KEY, json.dumps(header, sort_keys=True)), ("names", "{0: 'vehicle'}")):
         model.metadata_props.add(key=key, value=value)
     return bytes(model.SerializeToString(deterministic=True))
-
-
-def _export(network: Network, path: Path) -> None:
-    """Write the graph with float weights, whose input is normalized already."""
-    width, height = _CALIBRATION_SIZE
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the exporter, about sizes that are traced as constants
-        torch.onnx.export(
-            Deployed(network.cpu()).eval(),
-            (torch.zeros(1, height, width, 3),),
-            path,
-            input_names=["image"],
-            output_names=["boxes"],
-            dynamic_axes={"image": {1: "height", 2: "width"}, "boxes": {2: "cells"}},
-            opset_version=_OPSET,
-            dynamo=False,
-        )
 
 
 def _quantize(plain: Path, prepared: Path, target: Path, frames: Sequence[TrainingFrame]) -> None:
@@ -173,12 +167,11 @@ def _take_bytes(model: Any) -> None:
         following = next(node for node in graph.node if readers[0].output[0] in node.input)
         following.input[0] = image
         return
-    graph.initializer.extend(
-        [
-            onnx.numpy_helper.from_array(np.array(1 / SCALE, np.float32), "image_scale"),
-            onnx.numpy_helper.from_array(np.array(CENTER, np.uint8), "image_zero_point"),
-        ]
-    )
+    constants = {
+        "image_scale": np.array(1 / SCALE, np.float32),
+        "image_zero_point": np.array(CENTER, np.uint8),
+    }
+    graph.initializer.extend(onnx.numpy_helper.from_array(each, name) for name, each in constants.items())
     names = [image, "image_scale", "image_zero_point"]
     node = onnx.helper.make_node("DequantizeLinear", names, ["image_normalized"], name="normalize")
     readers[0].input[0] = node.output[0]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_path, check_sequence, describe, is_listing
+from vehicle_detection._common import check_path, check_sequence, check_type, describe, is_listing
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.detector import Detector
 from vehicle_detection.errors import InvalidInputError
@@ -232,12 +232,7 @@ class TrialEvaluator:
     """Trains and evaluates configurations on one set of patches."""
 
     def __init__(self, patch_set: PatchSet, options: TrialOptions) -> None:
-        given: object = patch_set
-        if not isinstance(given, PatchSet) or not len(given):
-            raise InvalidInputError(
-                f"patch_set must be a PatchSet with patches, got {describe(patch_set)}; "
-                "read one with load_training_patches"
-            )
+        check_type(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
         cache = options.cache
         if not isinstance(cache, FeatureCache):
             cache = FeatureCache(patch_set.patches, folder=cache, jobs=options.jobs)

@@ -137,10 +137,9 @@ def compare_configurations(
             if candidate.config is None:
                 runner.add_failed(candidate, stage="compare")
                 continue
+            named = {"name": candidate.name, "stage": "compare"}
             for split_name, seed, split in trials:
-                runner.run(
-                    candidate.config, split, seed, name=candidate.name, split_name=split_name, stage="compare"
-                )
+                runner.run(candidate.config, split, seed, split_name=split_name, **named)
     return runner.table()
 
 
