@@ -167,12 +167,9 @@ def _take_bytes(model: Any) -> None:
         following = next(node for node in graph.node if readers[0].output[0] in node.input)
         following.input[0] = image
         return
-    constants = {
-        "image_scale": np.array(1 / SCALE, np.float32),
-        "image_zero_point": np.array(CENTER, np.uint8),
-    }
-    graph.initializer.extend(onnx.numpy_helper.from_array(each, name) for name, each in constants.items())
     names = [image, "image_scale", "image_zero_point"]
+    constants = np.array(1 / SCALE, np.float32), np.array(CENTER, np.uint8)
+    graph.initializer.extend(map(onnx.numpy_helper.from_array, constants, names[1:]))
     node = onnx.helper.make_node("DequantizeLinear", names, ["image_normalized"], name="normalize")
     readers[0].input[0] = node.output[0]
     graph.node.insert(list(graph.node).index(readers[0]), node)

@@ -137,9 +137,9 @@ def compare_configurations(
             if candidate.config is None:
                 runner.add_failed(candidate, stage="compare")
                 continue
-            named = {"name": candidate.name, "stage": "compare"}
+            name, config = candidate.name, candidate.config
             for split_name, seed, split in trials:
-                runner.run(candidate.config, split, seed, split_name=split_name, **named)
+                runner.run(config, split, seed, name=name, split_name=split_name, stage="compare")
     return runner.table()
 
 
