@@ -27,6 +27,8 @@ from vehicle_detection.tables import TrackTable
 CARS = [SceneVehicle(distance_m=14.0, kind="sedan"), SceneVehicle(distance_m=9.0, lateral_m=4.2, kind="suv")]
 SCENE = render_scene(shape=(360, 640), vehicles=CARS, lane=1, random_state=1)
 
+NO_MODEL = FunctionModel(function=lambda image: ([], []), score="probability")
+
 
 @pytest.fixture(scope="module")
 def detector():
@@ -143,20 +145,6 @@ def test_the_best_template_of_a_classifier_is_explained():
     assert explanation.margin == pytest.approx(classifier.decision_function(patch[None])[0])
 
 
-@pytest.mark.parametrize(
-    ("box", "message"),
-    [
-        ([1, 2, 3], "box must be an"),
-        ([10, 10, 10, 20], r"box must be \[x1, y1, x2, y2\], 1 pixel or larger"),
-        ([[1, 2, 3, 4]] * 2, "box must be"),
-        ([30, 20, 10, 40], "box must be .* with x1 <= x2"),
-    ],
-)
-def test_bad_boxes_are_refused(detector, box, message):
-    with pytest.raises(InvalidInputError, match=message):
-        explain(detector, SCENE.image, box)
-
-
 @pytest.mark.parametrize(("seconds", "frame"), [((0.0, 0.04), 0), ((0.04, 0.08), 1)])
 def test_a_detected_box_of_a_track_is_explained(detector, tmp_path, seconds, frame):
     # Without any detected box, the largest predicted one.
@@ -173,13 +161,19 @@ def test_a_detected_box_of_a_track_is_explained(detector, tmp_path, seconds, fra
     assert "not found" not in picture.text
 
 
-def test_bad_arguments_are_refused(detector):
-    with pytest.raises(InvalidInputError, match="detector must be a Detector or VehicleDetector"):
-        explain(detector.model, SCENE.image, [0, 0, 9, 9])
-    with pytest.raises(InvalidInputError, match="image must be"):
-        explain(detector, SCENE.image[..., 0], [0, 0, 9, 9])
-    function = FunctionModel(function=lambda image: ([], []), score="probability")
-    with pytest.raises(InvalidInputError, match="detector must have a network or a classifier of"):
-        explain(VehicleDetector(function), SCENE.image, [0, 0, 9, 9])
-    with pytest.raises(InvalidInputError, match="box must lie in the image of 640x360 pixels"):
-        explain(detector, SCENE.image, [700, 0, 760, 60])
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"box": [1, 2, 3]}, "box must be an"),
+        ({"box": [10, 10, 10, 20]}, r"box must be \[x1, y1, x2, y2\], 1 pixel or larger"),
+        ({"box": [[1, 2, 3, 4]] * 2}, "box must be"),
+        ({"box": [30, 20, 10, 40]}, "box must be .* with x1 <= x2"),
+        ({"box": [700, 0, 760, 60]}, "box must lie in the image of 640x360 pixels"),
+        ({"image": SCENE.image[..., 0]}, "image must be"),
+        ({"detector": "default"}, "detector must be a Detector or VehicleDetector"),
+        ({"detector": VehicleDetector(NO_MODEL)}, "detector must have a network or a classifier of"),
+    ],
+)
+def test_bad_arguments_are_refused(detector, changes, message):
+    with pytest.raises(InvalidInputError, match=message):
+        explain(**{"detector": detector, "image": SCENE.image, "box": [0, 0, 9, 9]} | changes)
