@@ -180,7 +180,8 @@ def _select(
     for source in sources:
         keys = [{key for key in part.keys if wanted(part, key)} for part in source.sets]
         sets = tuple(select_frames(part, kept) for part, kept in zip(source.sets, keys) if kept)
-        chosen += [FrameDataset(source.name, sets)] * bool(sets)
+        if sets:
+            chosen.append(FrameDataset(source.name, sets))
     return chosen
 
 

@@ -87,18 +87,17 @@ def read_configurations(
 
 
 def _read(name: str | None, configuration: object, C: float) -> Candidate:
+    if isinstance(configuration, str):
+        configuration = FeatureParams.preset(configuration)
     if isinstance(configuration, FeatureParams):
-        options = dataclasses.asdict(configuration)
-    elif isinstance(configuration, str):
-        options = dataclasses.asdict(FeatureParams.preset(configuration))
-    elif isinstance(configuration, Mapping):
-        options = dict(configuration)
-        _check_names(options, "configuration")
-    else:
+        configuration = dataclasses.asdict(configuration)
+    if not isinstance(configuration, Mapping):
         raise InvalidInputError(
             "a configuration must be FeatureParams, a mapping of options or a preset's name; "
             f"got {describe(configuration)}"
         )
+    options = dict(configuration)
+    _check_names(options, "configuration")
     features = {key: value for key, value in options.items() if key in FEATURE_FIELDS}
     defaults = {"C": C, "mirror": True, "positive_weight": 1.0}
     training = {key: options.get(key, default) for key, default in defaults.items()}
