@@ -32,25 +32,16 @@ from vehicle_detection.features import PATCH_SIZE
 class PatchSet:
     """Training patches with labels and names. A notebook displays the counts of each source as a table.
 
-    Attributes
-    ----------
-    patches
-        ``(N, 64, 64, 3)`` uint8 RGB; another side length is allowed, but features cannot be extracted then.
-    labels, names
-        ``(N,)`` bool, True for a vehicle (may be given as 0 and 1); and N strings ``set/folder/file``, such
-        as ``vehicles/GTI_Far/image0000.png``.
-
-    Examples
-    --------
     >>> names = ["vehicles/KITTI/1.png", "vehicles/KITTI/2.png", "non-vehicles/GTI/1.png"]
     >>> patches = PatchSet(np.zeros((3, 64, 64, 3), np.uint8), [1, 1, 0], names)
     >>> patches[patches.labels], patches.counts()
     (PatchSet(2 patches of 64x64 pixels: 2 vehicles, 0 non-vehicles), {'GTI': 1, 'KITTI': 2})
     """
 
+    #: ``(N, 64, 64, 3)`` uint8 RGB; features cannot be extracted of another side length.
     patches: NDArray[np.uint8]
-    labels: NDArray[np.bool_]
-    names: tuple[str, ...]
+    labels: NDArray[np.bool_]  #: ``(N,)``, True for a vehicle; may be given as 0 and 1
+    names: tuple[str, ...]  #: ``set/folder/file``, such as ``vehicles/GTI_Far/image0000.png``
 
     if TYPE_CHECKING:  # The constructor converts its arguments.
 

@@ -42,30 +42,19 @@ def keyed_frames(frames: Frames) -> Mapping[FrameKey, NDArray[np.uint8]] | Frame
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LabelledFrames:
-    """A named set of frames with its labels.
+    """A named set of frames with its labels. A frame without any box shows no vehicle.
 
-    Attributes
-    ----------
-    name
-        Name of the set in tables.
-    frames
-        Images by key (``{7: image}``), a list of images that are numbered from 0, or a `FrameSet`, which
-        reads each image when it is used: ``(H, W, 3)`` uint8 RGB.
-    labels
-        True boxes; those of other frames are dropped. A frame without any box shows no vehicle.
-    horizon
-        Row of the horizon as a fraction of the frame height; None keeps the default of the search.
-
-    Examples
-    --------
     >>> labels = TrackTable([0], None, [[10, 10, 60, 50]])
     >>> LabelledFrames("road", [np.zeros((90, 120, 3), np.uint8)], labels)
     LabelledFrames('road', 1 frame, 1 box)
     """
 
-    name: str
+    name: str  #: name of the set in tables
+    #: ``(H, W, 3)`` uint8 RGB images by key (``{7: image}``), in a list that is numbered from 0, or in a
+    #: `FrameSet`, which reads each image when it is used.
     frames: Mapping[FrameKey, NDArray[np.uint8]] | FrameSet
-    labels: TrackTable
+    labels: TrackTable  #: true boxes; those of other frames are dropped
+    #: Row of the horizon as a fraction of the frame height; None keeps the default of the search.
     horizon: float | None = None
 
     def __post_init__(self) -> None:
