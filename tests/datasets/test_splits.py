@@ -37,22 +37,6 @@ def test_a_random_split_covers_all_patches_and_keeps_the_balance(labels, fractio
         assert abs(np.sum(labels[split.test] == label) - expected) <= 1
 
 
-@pytest.mark.parametrize(
-    ("labels", "options", "message"),
-    [
-        ([1, 1, 1, 0], {}, "3 vehicles and 1 non-vehicles are too few for a test part of 20%"),
-        ([], {}, "0 vehicles and 0 non-vehicles are too few"),
-        ([1, 1, 0, 0], {"test_size": 1}, r"test_size must be a fraction in \(0, 1\), got 1"),
-        ([1, 1, 0, 0], {"test_size": 0}, "test_size must be a number, greater than 0; got 0"),
-        ([1, 1, 0, 0], {"random_state": None}, "random_state must be an integer"),
-        ([-1, 1, 0, 0], {}, "patches_or_labels must be one boolean"),
-    ],
-)
-def test_an_impossible_random_split(labels, options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        split_random(labels, **{"random_state": 0, **options})
-
-
 @given(named_patches, fractions)
 def test_a_sequence_split_tests_on_the_end_of_each_folder(entries, fraction):
     folders = [folder for folder, _ in entries]
@@ -85,22 +69,6 @@ def test_a_split_by_source_separates_the_sources(entries):
     reverse = split_sources(patches, train=("KITTI", "Extras"), test="GTI")
     np.testing.assert_array_equal(reverse.train, split.test)
     np.testing.assert_array_equal(reverse.test, split.train)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"train": ("Kitty",)}, r"train must name sources of patch_set \(Extras, GTI, .*got 'Kitty'"),
-        ({"train": ("",)}, "train must name sources of patch_set .*got ''"),
-        ({"test": ("KITTI",)}, r"test must name sources of vehicles and of non-vehicles, got \('KITTI',\)"),
-        ({"train": ()}, "train must name sources of vehicles and of non-vehicles"),
-        ({"test": ("KITTI", "GTI")}, r"must not share sources, both match \['GTI', 'GTI_Far'\]"),
-    ],
-)
-def test_an_impossible_split_by_source(options, message):
-    patches = set_of([(folder, 1) for folder in FOLDERS])
-    with pytest.raises(InvalidInputError, match=message):
-        split_sources(patches, **options)
 
 
 @pytest.mark.parametrize(
@@ -186,21 +154,34 @@ def test_groups_are_found_across_chunks():
     assert len(split.test) == 550
 
 
+SEED, EACH, SAME = {"random_state": 0}, set_of([(folder, 1) for folder in FOLDERS]), copies_of([1] * 10)
+
+
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("split", "patches", "options", "message"),
     [
-        ({"test_size": 1}, r"test_size must be a fraction in \(0, 1\), got 1"),
-        ({"threshold": 0}, "threshold must be a number, greater than 0 .*at most 1; got 0"),
-        ({"random_state": None}, "random_state must be an integer"),
-        ({}, "a group of near duplicates that fits into the test part, 20% .*raise test_size or threshold"),
+        (split_random, [1, 1, 1, 0], SEED, "3 vehicles and 1 non-vehicles are too few .* test part of 20%"),
+        (split_random, [], SEED, "0 vehicles and 0 non-vehicles are too few"),
+        (split_random, [1, 1, 0, 0], SEED | {"test_size": 1}, r"test_size must be .* \(0, 1\), got 1"),
+        (split_random, [1, 1, 0, 0], SEED | {"test_size": 0}, "test_size must be .* greater than 0; got 0"),
+        (split_random, [1, 1, 0, 0], {"random_state": None}, "random_state must be an integer"),
+        (split_random, [-1, 1, 0, 0], SEED, "patches_or_labels must be one boolean"),
+        (split_sources, EACH, {"train": ("Kitty",)}, r"train must .* \(Extras, GTI, .*got 'Kitty'"),
+        (split_sources, EACH, {"train": ("",)}, "train must name sources of patch_set .*got ''"),
+        (split_sources, EACH, {"test": ("KITTI",)}, r"test must .* of non-vehicles, got \('KITTI',\)"),
+        (split_sources, EACH, {"train": ()}, "train must name sources of vehicles and of non-vehicles"),
+        (split_sources, EACH, {"test": ("KITTI", "GTI")}, r"both match \['GTI', 'GTI_Far'\]; use longer"),
+        (split_groups, SAME, {"test_size": 1}, r"test_size must be a fraction in \(0, 1\), got 1"),
+        (split_groups, SAME, {"threshold": 0}, "threshold must be .* greater than 0 .*at most 1; got 0"),
+        (split_groups, SAME, {"random_state": None}, "random_state must be an integer"),
+        (split_groups, SAME, {}, "a group of .* that fits .*, 20% .*raise test_size or threshold"),
+        (split_groups, SAME[[]], {}, "a group of near duplicates that fits into the test part"),
+        (split_sequences, SAME.patches, {}, "patch_set must be a PatchSet, .*read one with load_train"),
     ],
 )
-def test_an_impossible_split_by_groups(options, message):
-    patches = copies_of([1] * 10)
+def test_impossible_splits(split, patches, options, message):
     with pytest.raises(InvalidInputError, match=message):
-        split_groups(patches, **options)
-    with pytest.raises(InvalidInputError, match=message):
-        split_groups(patches[[]], **options)
+        split(patches, **options)
 
 
 def test_leakage_is_a_fraction_of_the_test_patches():
