@@ -88,11 +88,7 @@ def test_frames_are_checked(evaluate):
     for sides, options, message in (
         ((found, labels), {"frames": [1, 2]}, "predictions hold frame 0, which is not among the 2 frames"),
         ((found, labels), {"frames": [0, 1, 1]}, "frames must differ, got 1 more than once"),
-        (
-            (found, labels),
-            {"frames": ["a"]},
-            r"frame keys must be all numbers .* 'a' in frames",
-        ),
+        ((found, labels), {"frames": ["a"]}, r"frame keys must be all numbers .* 'a' in frames"),
         ((boxes_of(("x", 1, CAR)), labels), {}, "frame keys must be .* 'x' in predictions, 0 in labels"),
         ((found.boxes, labels), {}, r"predictions must be a TrackTable, .*TrackTable\.from_detections"),
         ((found, {}), {}, "labels must be a TrackTable"),

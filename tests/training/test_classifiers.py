@@ -64,10 +64,7 @@ def test_a_test_part_of_one_class_has_one_error_rate(patch_set):
         ({"classifiers": {}}, r"classifiers must map names to estimators .* at least one"),
         ({"classifiers": [GaussianNB()]}, r"classifiers must map names to estimators"),
         ({"classifiers": {"bayes": GaussianNB}}, r"classifiers\['bayes'\] must be an estimator .*instance"),
-        (
-            {"classifiers": {"own": SimpleNamespace(fit=print, predict=print)}},
-            r"classifiers\['own'\] must be an estimator with fit, predict and get_params",
-        ),
+        ({"classifiers": {"own": SimpleNamespace(fit=print, predict=print)}}, r"fit, predict and get_params"),
         ({"params": "luv-2384"}, r"params must be a FeatureParams"),
         ({"splits": "half"}, r"splits must be one of"),
         ({"seeds": 5}, r"seeds must be a list of different integers"),
