@@ -86,9 +86,7 @@ PLANS = {
         SPLITS[:3],
     ),
     "luv_channels": Plan(
-        {"HOG of L": FIRST, "HOG of L, U and V": _changed(FIRST, hog_channel="ALL")},
-        (COURSE_C,),
-        SPLITS[:3],
+        {"HOG of L": FIRST, "HOG of L, U and V": _changed(FIRST, hog_channel="ALL")}, (COURSE_C,), SPLITS[:3]
     ),
 }
 """Tables of linear SVMs by name."""

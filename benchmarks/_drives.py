@@ -15,13 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks._material import Context
 from benchmarks._report import Row, Target, at_least, at_most
-from vehicle_detection import (
-    FrameResult,
-    VehicleDetector,
-    evaluate_tracks,
-    iou_matrix,
-    render_drive,
-)
+from vehicle_detection import FrameResult, VehicleDetector, evaluate_tracks, iou_matrix, render_drive
 from vehicle_detection.evaluation import TrackScores
 from vehicle_detection.scenes import Drive, VehicleTruth
 from vehicle_detection.tables import TrackTable

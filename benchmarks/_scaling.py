@@ -140,12 +140,7 @@ _KERNELS = {
     "spatial_cells": "spatial bins",
 }
 _MODULES = {"cv2": {"resize": "spatial bins"}}
-_FUNCTIONS = {
-    "resize_band": "resize",
-    "convert_color": "color",
-    "hog_cells": "HOG cells",
-    "_hits": "hits",
-}
+_FUNCTIONS = {"resize_band": "resize", "convert_color": "color", "hog_cells": "HOG cells", "_hits": "hits"}
 
 
 @contextlib.contextmanager

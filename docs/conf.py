@@ -17,12 +17,7 @@ author = "The vehicle_detection authors"
 copyright = f"2026 {author}"  # noqa: A001
 version = release = __version__
 
-extensions = [
-    "myst_nb",
-    "numpydoc",
-    "sphinx.ext.autodoc",
-    "sphinx.ext.autosummary",
-]
+extensions = ["myst_nb", "numpydoc", "sphinx.ext.autodoc", "sphinx.ext.autosummary"]
 exclude_patterns = ["_readme", "_build"]
 default_role = "py:obj"
 

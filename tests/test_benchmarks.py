@@ -92,16 +92,7 @@ def test_stages_are_measured_and_the_search_is_restored(frame, classifier):
     before = dict(vars(search))
     stages = stage_seconds(frame, classifier, SEARCH, calls=2)
     assert vars(search) == before
-    known = {
-        "resize",
-        "color",
-        "HOG cells",
-        "blocks",
-        "spatial bins",
-        "histogram",
-        "correlation",
-        "hits",
-    }
+    known = {"resize", "color", "HOG cells", "blocks", "spatial bins", "histogram", "correlation", "hits"}
     assert known | {"rest"} == set(stages)
     assert all(seconds > 0 for seconds in stages.values())
 

@@ -589,12 +589,7 @@ def command_cases(folder: Path, effort: Effort) -> Iterator[Case]:
         for option, kind in _pairs(name, [option or "" for option in options], values, count):
             value = values[kind]
             words = [*COMMANDS[name], option, value] if option else [value, *COMMANDS[name][1:]]
-            yield (
-                f"`{name}`",
-                kind,
-                f"{name} {option} {value[:60]!r}",
-                partial(_run_command, name, words),
-            )
+            yield (f"`{name}`", kind, f"{name} {option} {value[:60]!r}", partial(_run_command, name, words))
 
 
 def _run_command(name: str, words: list[str]) -> None:

@@ -21,13 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
 import vehicle_detection
-from vehicle_detection import (
-    DetectorError,
-    FrameResult,
-    VehicleDetectionError,
-    VehicleDetector,
-    iou_matrix,
-)
+from vehicle_detection import DetectorError, FrameResult, VehicleDetectionError, VehicleDetector, iou_matrix
 from vehicle_detection._common import atomic_write, progress_bar, write_text
 from vehicle_detection.annotator import Annotator, DrawParams
 from vehicle_detection.camera import Camera

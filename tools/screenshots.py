@@ -53,10 +53,7 @@ def make_screenshots(folder: Path, detector: VehicleDetector) -> None:
     with tempfile.TemporaryDirectory(prefix="vehicle-screenshots-") as name:
         temporary = Path(name)
         with Browser(temporary) as browser:  # first, because it may be missing
-            pages = {
-                EXPLORER: _write_explorer_page(temporary),
-                REPORT: _write_report(temporary, detector),
-            }
+            pages = {EXPLORER: _write_explorer_page(temporary), REPORT: _write_report(temporary, detector)}
             pictures = {name: _photograph(browser, page) for name, page in pages.items()}
     for name, picture in pictures.items():
         _, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])

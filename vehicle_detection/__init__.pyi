@@ -3,14 +3,7 @@ from .annotator import Annotator, DrawParams, draw_diagnostics, draw_tracks
 from .boxes import Detections, clip_boxes, iou_matrix, non_max_suppression
 from .camera import Camera, open_camera, read_camera, write_camera
 from .course import HeatmapDetector
-from .datasets import (
-    FrameSet,
-    PatchSet,
-    fetch_patches,
-    load_frames,
-    load_patches,
-    load_training_patches,
-)
+from .datasets import FrameSet, PatchSet, fetch_patches, load_frames, load_patches, load_training_patches
 from .detector import Detector, VehicleDetector, load_model
 from .drawing import blur_boxes, draw_boxes, draw_detections, draw_labeled_bboxes
 from .drive import (
@@ -33,12 +26,7 @@ from .errors import (
     VehicleDetectionError,
     VideoError,
 )
-from .evaluation import (
-    LabelledFrames,
-    evaluate_detections,
-    evaluate_tracks,
-    explain,
-)
+from .evaluation import LabelledFrames, evaluate_detections, evaluate_tracks, explain
 from .features import (
     FeatureParams,
     bin_spatial,
@@ -61,11 +49,7 @@ from .search import SearchBand, SearchParams
 from .svm import VehicleClassifier, load_classifier
 from .tables import TrackTable
 from .tracking import FrameResult, Track, Tracker, TrackParams, estimate_horizon
-from .training import (
-    TrainingOptions,
-    train_and_evaluate,
-    train_classifier,
-)
+from .training import TrainingOptions, train_and_evaluate, train_classifier
 from .video import (
     VideoInfo,
     annotate_clip,

@@ -7,13 +7,7 @@ onnx = pytest.importorskip("onnx", reason="export needs onnx, the extra [train]"
 from tests.training.networks import random_network  # noqa: E402
 from vehicle_detection.errors import ModelFileError  # noqa: E402
 from vehicle_detection.network import load_network, open_session  # noqa: E402
-from vehicle_detection.training import (  # noqa: E402
-    TrainingFrame,
-    export_network,
-    load_content,
-    read_weights,
-    set_metadata,
-)
+from vehicle_detection.training import TrainingFrame, export_network, load_content, read_weights, set_metadata  # noqa: E402
 from vehicle_detection.training.architecture import Network  # noqa: E402
 from vehicle_detection.training.export import _CALIBRATION_SIZE  # noqa: E402
 

@@ -2,6 +2,7 @@
 
 from vehicle_detection._common.augment import blur_patches, degrade_patches, mirror_patches
 from vehicle_detection._common.checks import (
+    Checked,
     Floats,
     check_array,
     check_bool,
@@ -17,12 +18,16 @@ from vehicle_detection._common.checks import (
     check_sequence,
     check_shape,
     check_type,
+    checked_field,
+    choice,
     describe,
+    flag,
+    integer,
     is_listing,
+    number,
     shorten,
     store_number,
 )
-from vehicle_detection._common.fields import Checked, checked_field, choice, flag, integer, number
 from vehicle_detection._common.files import (
     atomic_write,
     check_suffix,
@@ -48,14 +53,17 @@ from vehicle_detection._common.text import (
 )
 from vehicle_detection._common.threads import (
     JOBS_VARIABLE,
+    NEW_ARRAYS,
+    SPARE,
     Closing,
     ThreadTeam,
+    Workspace,
     available_cores,
     call_in_thread,
     resolve_jobs,
     single_threaded_opencv,
+    with_spare,
 )
 from vehicle_detection._common.units import ROUGH_DISTANCE, UNITS, Units, format_with_error
-from vehicle_detection._common.workspace import NEW_ARRAYS, SPARE, Workspace, with_spare
 
 check_environment()
