@@ -29,8 +29,6 @@ ALLOWED = {
     ("cli", "scenes"),
     ("training", "scenes"),
 }
-# Folders on their way to a ring.
-MOVING = {}
 
 HEAVY = {"matplotlib", "moviepy", "sklearn", "pandas", "pooch", "jinja2", "dask", "pyarrow", "motmetrics"}
 HEAVY |= {"ipywidgets", "IPython"}
@@ -101,7 +99,7 @@ MODULES = sorted(set(FILES) - {"__init__", "__main__"})
 
 
 def ring_of(name):
-    ring = MOVING.get(package_of(name), package_of(name))
+    ring = package_of(name)
     return ring if ring in OUTER or ring == "training" else "core"
 
 
@@ -120,14 +118,11 @@ def test_a_module_imports_its_own_ring_and_the_core_through_interfaces(name):
 def test_imports_are_acyclic():
     """Counting the imports inside functions and those for types."""
     graph = {name: {*own_modules(name)} - {name} for name in MODULES}
-    try:
-        list(graphlib.TopologicalSorter(graph).static_order())
-    except graphlib.CycleError as error:
-        pytest.xfail(f"a circle: {error.args[1]}")
+    list(graphlib.TopologicalSorter(graph).static_order())  # else CycleError, with the circle
 
 
 def test_the_root_is_small():
-    assert len(list(FOLDER.glob("*.py"))) <= 24
+    assert len(list(FOLDER.glob("*.py"))) <= 18
 
 
 @pytest.mark.parametrize("name", sorted(FILES))
