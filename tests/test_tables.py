@@ -165,6 +165,19 @@ def test_times_of_frames_that_are_not_evenly_spaced():
         assert times(*unusual) is None
 
 
+def test_selections_have_the_times_of_their_frames():
+    table = TrackTable()
+    for frame in range(6):
+        table.append(frame, 5 + frame / 10, [track(1)])
+    first = table.select([0, 1])
+    assert first.times() == pytest.approx([5.0, 5.1])
+    assert table[:1].times() == pytest.approx(table.times())
+    assert (table.frame(2).times(), table.select([]).times(), table.frame(2).first_time) == (None, None, 5.0)
+    renamed = table.renamed(str)
+    assert (renamed.times(), renamed.frame("2").times(), renamed.first_time) == (None, None, None)
+    assert boxes_of(("a.png", 1, CAR)).times() is None
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

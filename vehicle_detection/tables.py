@@ -53,7 +53,7 @@ _ABSURD, _MAX_ID = 1e9, 2**62  # distances and speeds beyond the first are unkno
 
 
 class _Column(NamedTuple):
-    """A column: the value of a row without one, whose type is that of the column, and its range."""
+    """Default of a column, which also sets its type, and its allowed range."""
 
     missing: float
     low: float = -math.inf
@@ -76,15 +76,19 @@ _COLUMNS = {
 }
 """All columns except ``frame`` and the corners of the boxes."""
 
-_APPENDED = (*TRACK_COLUMNS[6:], "time_since_update")  # of a `Track`
+_VALUE_COLUMNS = TRACK_COLUMNS[6:]  # all but frame, track and box
+_APPENDED = (*_VALUE_COLUMNS, "time_since_update")  # of a `Track`
 
 
 class TrackTable:
     """Boxes of several frames, one row each: tracks, detections or labels.
 
-    ``table["score"]`` is a column, named as in the files; ``table[rows]`` selects rows by an index, a slice,
-    a mask or a list. Iterating yields the key and the table of each frame. A table of a video grows by
-    `append`, which sets `first_time`, the time of the first frame in seconds, None if unknown.
+    ``table["score"]`` is a column, named as in the files; one that the table lacks is full of its default.
+    ``table[rows]`` selects rows by an index, a slice, a mask or a list and keeps all frame keys; `frame` and
+    `select` keep only theirs. Iterating yields the key and the table of each frame.
+
+    A table of a video grows by `append`, which sets `first_time`, the time of the video's first frame in
+    seconds, None if unknown. Selections keep it, even without that frame.
 
     Parameters
     ----------
@@ -98,7 +102,8 @@ class TrackTable:
         All frames, including those without a box; the frames of the rows are added.
     **columns
         Other columns, ``(N,)`` or None: ``score``, ``confidence``, ``distance_m``, ``distance_std_m``,
-        ``speed_mps`` and ``speed_std_mps`` of tracks and detections, NaN where a value is unknown; and
+        ``speed_mps`` and ``speed_std_mps`` of tracks and detections, NaN where a value is unknown;
+        ``time_since_update`` (s) of tracks, which is neither in `columns` nor in files; and
         ``occluded`` (0 visible, 1 partly, 2 largely hidden), ``truncated`` (fraction outside the image) and
         ``ignore`` (not scored; with track -1 a region) of labels. A table without ``score`` holds labels.
 
@@ -159,7 +164,8 @@ class TrackTable:
     def _take(self, rows: NDArray[np.intp], keys: Sequence[FrameKey]) -> TrackTable:
         taken = {name: column[: self._size][rows] for name, column in self._columns.items()}
         table = TrackTable.__new__(TrackTable)._set(taken, keys)
-        table._times, table.first_time = self._times, self.first_time
+        table._times = {int(key): self._times[int(key)] for key in keys if key in self._times}
+        table.first_time = self.first_time
         return table
 
     @classmethod
@@ -288,7 +294,7 @@ class TrackTable:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns that the table has, in the order of the files."""
-        names = [name for name in (*TRACK_COLUMNS[6:], *LABEL_COLUMNS) if name in self._columns]
+        names = [name for name in (*_VALUE_COLUMNS, *LABEL_COLUMNS) if name in self._columns]
         return ("frame", "track_id", *CORNERS, *names)
 
     @property
@@ -302,20 +308,20 @@ class TrackTable:
         return tuple(self._keys)
 
     @overload
-    def __getitem__(self, rows: str) -> NDArray[Any]: ...
+    def __getitem__(self, item: str) -> NDArray[Any]: ...
     @overload
-    def __getitem__(self, rows: int | slice | NDArray[Any] | list[int]) -> TrackTable: ...
-    def __getitem__(self, rows: str | int | slice | NDArray[Any] | list[int]) -> NDArray[Any] | TrackTable:
-        if not isinstance(rows, str):
-            taken = [rows] if isinstance(rows, (int, np.integer)) else rows
+    def __getitem__(self, item: int | slice | NDArray[Any] | list[int]) -> TrackTable: ...
+    def __getitem__(self, item: str | int | slice | NDArray[Any] | list[int]) -> NDArray[Any] | TrackTable:
+        if not isinstance(item, str):
+            taken = [item] if isinstance(item, (int, np.integer)) else item
             return self._take(np.arange(len(self))[taken], self._keys)
-        if rows in CORNERS:
-            return self.boxes[:, CORNERS.index(rows)]
-        if rows in self._columns:
-            return self._columns[rows][: self._size]
-        if rows not in _COLUMNS:
-            raise InvalidInputError(f"column must be one of {', '.join(_COLUMNS)}; got {rows!r}")
-        return np.full(len(self), _COLUMNS[rows].missing)
+        if item in CORNERS:
+            return self.boxes[:, CORNERS.index(item)]
+        if item in self._columns:
+            return self._columns[item][: self._size]
+        if item not in _COLUMNS:
+            raise InvalidInputError(f"column must be one of {', '.join(_COLUMNS)}; got {item!r}")
+        return np.full(len(self), _COLUMNS[item].missing)
 
     def rows(self, key: FrameKey) -> NDArray[np.intp]:
         """Row numbers of a frame's boxes; empty for a frame without boxes."""
@@ -368,9 +374,11 @@ class TrackTable:
     def times(self) -> Floats | None:
         """Time (s) of each frame from 0 to the last one, interpolated where it is unknown or does not ascend.
 
-        None if that is so for most frames, for the first one or for the last one.
+        None if that is so for most frames, for the first one or for the last one, and for frames with names.
         """
-        times = np.full(int(self._keys[-1]) + 1 if self._keys else 0, np.nan)
+        if not self._times:
+            return None
+        times = np.full(int(self._keys[-1]) + 1, np.nan)
         times[list(self._times)] = list(self._times.values())
         known = np.isfinite(times)
         latest = np.maximum.accumulate(np.where(known, times, -np.inf))
@@ -381,7 +389,10 @@ class TrackTable:
         return np.asarray(np.interp(np.arange(times.size), rows, times[rows]))
 
     def renamed(self, rename: Callable[[Any], FrameKey]) -> TrackTable:
-        """Return a copy in which ``rename(key)`` replaces every frame key."""
+        """Return a copy, without times, in which ``rename(key)`` replaces every frame key.
+
+        Its `first_time` is None.
+        """
         if not callable(rename):
             raise InvalidInputError(f"rename must be a function of a frame key; got {describe(rename)}")
         frames, keys = ([rename(key) for key in each] for each in (self["frame"].tolist(), self._keys))
@@ -442,7 +453,8 @@ def parse_cells(
 ) -> tuple[dict[str, Any], list[str]]:
     """Arguments of `TrackTable` from cells, which are text or values, by the name of their column.
 
-    `places` states where each row is, for messages. Only vehicles are kept; returns their places, too.
+    `places` states where each row is, for messages. Keeps vehicles and, as ignored rows, lookalikes; also
+    returns the places of the kept rows.
     """
     missing = [name for name in ("frame", *CORNERS) if name not in cells]
     if missing:
@@ -535,7 +547,7 @@ def parse_number(cell: Any, name: str, place: str) -> float:
 
 
 def _parse_numbers(name: str, cells: Sequence[Any], places: Sequence[str]) -> NDArray[Any]:
-    """Numbers of a column; a missing one, except for a corner or a score, is the usual one of the column."""
+    """Numbers of a column; a missing one, except for a corner or a score, gets the column's default."""
     column = _COLUMNS.get("track_id" if name == "track" else name, _Column(math.nan))
     kind = type(column.missing)
     values = []
