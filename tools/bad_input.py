@@ -147,7 +147,7 @@ def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
 INTERNAL = {
     "Event.text", "FeatureParams.spatial_planes", "FrameResult.unsearched", "FrameSource.audio",
     "FrameSource.read", "HeatParams.for_search", "NetworkModel.feeds", "NetworkModel.input_size_for",
-    "NetworkModel.probability", "NetworkModel.scores", "NetworkModel.with_confidence",
+    "NetworkModel.network_probability", "NetworkModel.scores", "NetworkModel.with_confidence",
     "RegionParams.with_peak", "SearchBand.place", "SearchParams.place", "TrackTable.select",
 }  # fmt: skip
 """Methods that only the library calls, with its own results."""

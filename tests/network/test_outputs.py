@@ -193,7 +193,7 @@ def test_candidates_are_sorted_and_above_the_minimum(kind, seed, spread, low):
     if kind == "detr":
         outputs, order = [array[..., :4], array[..., 4:]], (0, 1)
     found = OutputFormat(kind, None, kind == "detr", order).decode(outputs, SIZE, np.array([0, 1]), low)
-    assert found.boxes.shape == (len(found.scores), 4)
-    assert (found.scores >= low - 1e-6).all()
-    assert (np.diff(found.scores) <= 0).all()
+    assert found.boxes.shape == (len(found.probabilities), 4)
+    assert (found.probabilities >= low - 1e-6).all()
+    assert (np.diff(found.probabilities) <= 0).all()
     assert np.isin(found.class_ids, [0, 1]).all()

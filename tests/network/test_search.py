@@ -75,7 +75,7 @@ def test_the_probability_of_a_score(model):
     scores = model.scores(probabilities)
     expected = 0.5 * np.array([logit(p) for p in probabilities]) - 0.25 + 0.5
     np.testing.assert_allclose(scores, expected)
-    np.testing.assert_allclose([model.probability(each) for each in scores], probabilities, atol=1e-5)
+    np.testing.assert_allclose([model.network_probability(each) for each in scores], probabilities, atol=1e-5)
     confidences = model.calibration.probability(scores)
     np.testing.assert_allclose(confidences, 1 / (1 + np.exp(-(expected - 0.5))))
     assert np.isfinite(to_log_odds(np.array([0.0, 1.0]))).all()

@@ -181,7 +181,7 @@ class _Surroundings:
             picture[y1:y2, x1:x2] = model.input_format.padding
         candidates = self._search.find_candidates(picture, self._params, _ANY_SCORE)
         near = iou_matrix(self._place(box)[None], candidates.boxes)[0] >= _MIN_IOU
-        return float(model.scores(np.append(candidates.scores[near], 0.0)).max())
+        return float(model.scores(np.append(candidates.probabilities[near], 0.0)).max())
 
 
 def _explain_classifier(

@@ -78,10 +78,17 @@ class NetworkModel(Checked):
     classes, class_ids
         Names of the classes by their numbers, None if they are unknown; and numbers of those to keep, None:
         all.
-    slope, offset, threshold, nms_iou
+    slope, offset
         Platt scaling: ``slope * logit(p) + offset`` is the log-odds that a box contains a vehicle, given its
-        probability `p` in the network's output; minimum log-odds of a vehicle; and IoU above which the less
-        probable box is dropped.
+        probability `p` in the network's output.
+    threshold
+        Minimum of these log-odds of a vehicle.
+    nms_iou
+        IoU above which the less probable of two boxes is dropped.
+    input_name, extra_inputs
+        Name of the input that gets the image, and the other inputs, which get its width and height.
+    device, runtime
+        ``"cpu"`` or ``"cuda"``, and ``"onnxruntime"``, ``"openvino"`` or ``"auto"`` (the faster one).
 
     Examples
     --------
@@ -113,7 +120,10 @@ class NetworkModel(Checked):
 
     @property
     def calibration(self) -> Platt:
-        """Probability that a box contains a vehicle, by its score: the log-odds above the threshold."""
+        """Probability that a box contains a vehicle, by its score: the log-odds above the threshold.
+
+        `slope` and `offset` are applied already, by `scores`.
+        """
         return Platt(-1.0, -self.threshold)
 
     def with_confidence(self, conf: float) -> NetworkModel:
@@ -121,7 +131,7 @@ class NetworkModel(Checked):
         return dataclasses.replace(self, threshold=logit(conf))
 
     def open_search(self, jobs: int | None = None) -> NetworkSearch:
-        """Open a search of frames with this network, of which several threads share a frame."""
+        """Open a search with this network; several threads work on each frame."""
         return NetworkSearch(self, jobs)
 
     def __repr__(self) -> str:
@@ -144,8 +154,8 @@ class NetworkModel(Checked):
         """Convert probabilities of the network to log-odds above the threshold."""
         return self.slope * to_log_odds(probabilities) + self.offset - self.threshold
 
-    def probability(self, score: float) -> float:
-        """Probability of the network for a score, rounded down: the inverse of `scores`."""
+    def network_probability(self, score: float) -> float:
+        """Probability in the network's output that gives this score, rounded down; undoes `scores`."""
         return to_probability((score + self.threshold - self.offset) / self.slope - 1e-6)
 
     def input_size_for(self, params: NetworkParams) -> int:
@@ -193,22 +203,23 @@ class NetworkSearch(FrameSearch):
         self, frame: NDArray[np.uint8], params: NetworkParams, min_vehicle_score: float
     ) -> tuple[Detections, Detections]:
         candidates = self.find_candidates(frame, params, min(min_vehicle_score, params.min_score))
-        found = Detections(candidates.boxes, self.model.scores(candidates.scores))
+        found = Detections(candidates.boxes, self.model.scores(candidates.probabilities))
         vehicles = found[greedy_nms(found.boxes, found.scores, max_iou=self.model.nms_iou)]
         return found[found.scores >= params.min_score], vehicles[vehicles.scores >= min_vehicle_score]
 
     def find_candidates(
         self, frame: NDArray[np.uint8], params: NetworkParams, min_score: float
     ) -> Candidates:
-        """Boxes before suppression with at least this score, best first, in pixels of the frame."""
+        """Boxes whose log-odds are at least `min_score`, best first, in pixels of the frame."""
         model = self.model
         with single_threaded_opencv():
             array, scaled = model.input_format.prepare(frame, model.input_size_for(params), self.workspace)
         axes = (2, 3) if model.input_format.channels_first else (1, 2)
         size = array.shape[axes[0]], array.shape[axes[1]]
         outputs = self._open().run(model.feeds(array, size))
+        lowest = model.network_probability(min_score)
         try:
-            found = model.output_format.decode(outputs, size, model.class_ids, model.probability(min_score))
+            found = model.output_format.decode(outputs, size, model.class_ids, lowest)
         except ModelFileError as error:
             raise ModelFileError(
                 f"{model.name} computes invalid values: {error}; download or export it again"
@@ -218,7 +229,7 @@ class NetworkSearch(FrameSearch):
         factors = np.array([width / scaled[1], height / scaled[0]] * 2)
         boxes = np.clip(found.boxes * factors, 0.0, [width, height, width, height])
         inside = box_areas(boxes) > 0
-        return Candidates(boxes[inside], found.scores[inside], found.class_ids[inside])
+        return Candidates(boxes[inside], found.probabilities[inside], found.class_ids[inside])
 
     def _open(self) -> Session:
         with self._lock:

@@ -164,10 +164,10 @@ class InputFormat:
 
 
 class Candidates(NamedTuple):
-    """Boxes before suppression, best first, in pixels of the network's input."""
+    """Boxes before suppression, best first."""
 
     boxes: Floats  # (N, 4) [x1, y1, x2, y2]
-    scores: Floats  # (N,) probabilities
+    probabilities: Floats  # (N,), in the network's output
     class_ids: NDArray[np.intp]  # (N,)
 
 
@@ -185,12 +185,12 @@ class OutputFormat:
     order: tuple[int, ...] = (0,)
 
     def decode(
-        self, outputs: list[Array], size: Size, classes: NDArray[np.intp] | None, min_score: float
+        self, outputs: list[Array], size: Size, classes: NDArray[np.intp] | None, min_probability: float
     ) -> Candidates:
         """Decode the outputs for an input of this height and width to boxes of `classes` (None: all).
 
-        The class of a box is its most probable one. A `ModelFileError` says what is not finite, without a
-        name.
+        The boxes are in pixels of the input, and the class of each is its most probable one. A
+        `ModelFileError` says what is not finite, without a name.
         """
         boxes, scores, objectness, labels = self._split(outputs)
         kept = scores if classes is None or labels is not None else scores[classes[classes < len(scores)]]
@@ -199,7 +199,7 @@ class OutputFormat:
             best = best * objectness
         if not np.isfinite(best.sum(dtype=np.float64)):
             raise ModelFileError("scores are not finite")
-        rows = np.flatnonzero(best >= min_score)
+        rows = np.flatnonzero(best >= min_probability)
         if labels is None:
             class_ids = scores[:, rows].argmax(axis=0) if len(scores) > 1 else np.zeros(len(rows), np.intp)
         else:
