@@ -53,7 +53,7 @@ _LENS_STD, _GIVEN_LENS_STD, _UNKNOWN_LENS_STD = 0.08, 0.03, 0.25
 # Standard error of a given height of the camera (m).
 _GIVEN_HEIGHT_STD = 0.05
 # Horizon of an unknown camera, its standard error, that of a given horizon, and the largest one of a horizon
-# that counts as known; fractions of the frame's height.
+# that counts as known; fractions of the frame's height. The first is that of a level camera.
 _HORIZON, _HORIZON_STD, _GIVEN_HORIZON_STD, _KNOWN_HORIZON_STD = 0.5, 0.06, 0.012, 0.02
 # Largest angle from the optical axis (radians) at which boxes are converted to a pinhole camera.
 _MAX_ANGLE = math.radians(80)
@@ -69,7 +69,7 @@ LENSES: dict[str, tuple[float, bool]] = {
 }
 """Typical lenses: field of view along the longer side in degrees, and whether the lens is a fisheye.
 
-Their errors are those of a guess; a calibrated camera (`read_camera`) is better.
+Their focal lengths have an error of 8%; a calibrated camera (`read_camera`) is better.
 """
 
 
@@ -82,8 +82,8 @@ class Camera(Checked):
     focal_px
         Focal length in pixels: the frame's longer side over ``2 * tan(half the field of view along it)``.
     horizon_px, horizon_std_px
-        Row of the horizon, and its standard error if the row is a guess (0 if it was measured). The tracker
-        estimates the row from the vehicles it tracks, with this prior.
+        Row of the horizon and its standard error; 0 means exact. The tracker estimates the row from the
+        vehicles it tracks, with this prior.
     height_m
         Height of the lens above the road.
     vehicle_width_m, vehicle_width_std_m, vehicle_height_m
@@ -163,6 +163,7 @@ class Camera(Checked):
             must keep the radius positive up to the edge of the field of view.
         """
         height, width = check_shape(shape)
+        # The default is about 400/720, the horizon of the course's video.
         horizon = check_number(horizon, "horizon", low=-10, high=10)
         if lens is not None:
             check_choice(lens, "lens", LENSES)
@@ -425,6 +426,7 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
             values = {"horizon": _HORIZON, "horizon_std_px": _HORIZON_STD * shape[0]} | values
         if "focal_px" not in values and "lens" not in values:
             values = {"focal_std": _GIVEN_LENS_STD if "fov" in values else _UNKNOWN_LENS_STD} | values
+        # A `focal_px` without `focal_std` keeps the default error: the file does not say how it was measured.
         derived = {name: values.pop(name) for name in _PIXEL_FIELDS[:2] if name in values}
         camera = Camera.for_frame(shape, **values)
         return dataclasses.replace(camera, **derived, shape=None if size is None else shape)

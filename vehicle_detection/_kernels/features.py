@@ -61,15 +61,17 @@ _TILE = 768
 def hog_cells(image, channels, cell, cotangents, cells):
     """Sum gradient magnitudes into the orientation histograms of cells.
 
-    `image` is ``(H, W * channels)`` uint8 and at least as large as the cells, `cell` their side in pixels,
-    `cotangents` ``(orient,)`` float32 those of the orientations' lower bounds (infinite for the first), and
-    `cells` the output ``(channels, orient, cell rows, cell columns)`` float32, means over the cells' pixels.
+    `image` is ``(H, W * channels)`` uint8 or float and at least as large as the cells, `cell` their side in
+    pixels, `cotangents` ``(orient,)`` float32 those of the orientations' lower bounds (infinite for the
+    first), and `cells` the output ``(channels, orient, cell rows, cell columns)`` float32, means over the
+    cells' pixels.
 
     The reference is ``skimage.feature.hog``: central differences without halving, zero at the array's border,
     unsigned orientation, hard binning. Orientation `k` starts at ``k * 180 / orient`` degrees; an angle in
     (0, 180) is beyond that bound if ``gx / gy`` is at most its cotangent. This needs one division and no
     arctangent, and is equal for opposite gradients. The quotients of integers up to 255 are too far from the
-    cotangents for rounding to matter. Sums are cumulative over the bounds and differenced at the end.
+    cotangents for rounding to matter; of floats, a gradient exactly on a bound may fall into the other bin.
+    Sums are cumulative over the bounds and differenced at the end.
     """
     orient, rows, columns = cells.shape[1], cells.shape[2], cells.shape[3]
     span = cell * channels

@@ -37,9 +37,23 @@ FEATURE_FIELDS = tuple(field.name for field in dataclasses.fields(FeatureParams)
 TRAINING_FIELDS = ("C", "mirror", "positive_weight")
 _FIELDS = (*FEATURE_FIELDS, *TRAINING_FIELDS)
 
+_FRAME_METRICS = ("frame_f1", "frame_best_f1", "frame_average_precision", "frame_iou")
+
+COLUMNS = (
+    "status", "message", "stage", "configuration", *FEATURE_FIELDS, "n_features", *TRAINING_FIELDS, "split",
+    "seed", "train_size", "test_size", "train_accuracy", "accuracy", *_FRAME_METRICS, "frame_f1_by_set",
+    "search_ms", "fit_seconds", "trial",
+)  # fmt: skip
+"""Columns of a row; `compare_configurations` documents them."""
+
+_TIMED_SHAPE = (720, 1280)
+_TIMED_RUNS = 15
+
 _MAX_COMBINATIONS = 100_000
 
 _BOOLEANS = {"true": True, "yes": True, "false": False, "no": False}
+
+_LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -177,21 +191,6 @@ def _join_options(options: Mapping[str, Any]) -> str:
     return " ".join(f"{key}={value}" for key, value in options.items() if key in FEATURE_FIELDS) or "default"
 
 
-_LOGGER = logging.getLogger(__name__)
-
-_FRAME_METRICS = ("frame_f1", "frame_best_f1", "frame_average_precision", "frame_iou")
-
-COLUMNS = (
-    "status", "message", "stage", "configuration", *FEATURE_FIELDS, "n_features", *TRAINING_FIELDS, "split",
-    "seed", "train_size", "test_size", "train_accuracy", "accuracy", *_FRAME_METRICS, "frame_f1_by_set",
-    "search_ms", "fit_seconds", "trial",
-)  # fmt: skip
-"""Columns of a row; `compare_configurations` documents them."""
-
-_TIMED_SHAPE = (720, 1280)
-_TIMED_RUNS = 15
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrialOptions:
     """What each trial measures besides the accuracy on patches, and its resources.
@@ -253,7 +252,10 @@ class TrialEvaluator:
         self._options_digest = digest_of(used, options.time_search)
 
     def trial_id(self, config: TrialConfig, split: Split, seed: int, *, on_frames: bool = True) -> str:
-        """Hash of everything that the result depends on."""
+        """Hash of patches, configuration, split, seed and, with `on_frames`, the options and the frames.
+
+        Of the frames only the labels count, not the pixels; nor do the version and the machine.
+        """
         options = self._options_digest if on_frames else None
         return digest_of(self._patches_digest, config.to_columns(), split.train, split.test, seed, options)
 
