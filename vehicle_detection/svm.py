@@ -35,9 +35,10 @@ KIND = "patches"
 _SCALERS = ("StandardScaler", "RobustScaler", "MinMaxScaler", "MaxAbsScaler")
 # Channels whose values are 0-1 in float images. Those of LUV and LAB have other ranges.
 UNIT_CHANNELS = dict.fromkeys(("RGB", "YUV", "YCrCb"), (0, 1, 2)) | {"HSV": (1, 2), "HLS": (1, 2)}
-# Greatest sum of mean and scale of a spatial bin with values 0-1. For the last channel of LUV and LAB: the
-# greatest mean in float images, where gray is 0, and the least sum in uint8 images, where gray is over 127.
-_MAX_UNIT, _MAX_FLOAT_MEAN, _GRAY = 2.5, 64.0, 128.0
+# Greatest sum of mean and scale of a spatial bin with values 0-1.
+# LUV and LAB, last channel: gray is 0 in float images and over 127 in uint8. Float: every mean is below 64,
+# and some mean + scale is below 128.
+_MAX_UNIT_SUM, _MAX_FLOAT_MEAN, _GRAY = 2.5, 64.0, 128.0
 
 # Fitted to the boxes of the model "highway" in labelled frames of the course's road, not to patches: most
 # windows of a frame show no vehicle.
@@ -48,7 +49,10 @@ CLASSIFIER_REMEDY = "load_classifier, train_classifier or VehicleClassifier.from
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """A linear SVM on scaled features: ``score = coef @ ((x - mean) / scale) + intercept``."""
+    """One linear SVM, called a template because its weights act as a filter.
+
+    The features are scaled: ``score = coef @ ((x - mean) / scale) + intercept``.
+    """
 
     mean: NDArray[np.float64]
     scale: NDArray[np.float64]
@@ -322,6 +326,7 @@ def fold_estimators(steps: Sequence[Any], length: int) -> Template:
     mean, scale = np.zeros(length), np.ones(length)
     for scaler in scalers:
         offset, factor = _scaling(scaler, length)
+        # ((x - mean) / scale - offset) / factor = (x - (mean + scale * offset)) / (scale * factor)
         mean, scale = mean + scale * offset, scale * factor
     return Template(mean, scale, *_weights(classifier, length))
 
@@ -353,6 +358,7 @@ def _scaling(scaler: Any, length: int) -> tuple[NDArray[np.float64], NDArray[np.
     if getattr(scaler, "clip", False):
         raise InvalidInputError(f"pipeline must not clip; train with {name}(clip=False)")
     if name == "MinMaxScaler":
+        # It computes x * scale_ + min_.
         return -scaler.min_ / scaler.scale_, 1 / scaler.scale_
     center = getattr(scaler, "mean_" if name == "StandardScaler" else "center_", None)
     if center is not None and getattr(scaler, "with_mean", True):
@@ -421,7 +427,7 @@ def _has_float_bins(mean: Floats, scale: Floats, params: FeatureParams) -> bool:
     means, scales = (params.spatial_planes(values[: params.spatial_length]) for values in (mean, scale))
     if params.spatial_space in UNIT_CHANNELS:
         channels = UNIT_CHANNELS[params.spatial_space]
-        return bool((np.abs(means) + scales)[list(channels)].max() < _MAX_UNIT)
+        return bool((np.abs(means) + scales)[list(channels)].max() < _MAX_UNIT_SUM)
     is_centered = bool(means.any())
     return is_centered and bool(means[2].max() < _MAX_FLOAT_MEAN and (means + scales)[2].min() < _GRAY)
 
@@ -433,4 +439,5 @@ def _has_first_bins_only(mean: Floats, scale: Floats, params: FeatureParams) -> 
     if not params.hist_feat or params.hist_bins == 1 or not channels:
         return False
     means, scales = (values[bins].reshape(3, -1)[channels, 1:] for values in (mean, scale))
+    # StandardScaler gives constant features scale 1.
     return bool((means == 0).all() and (scales == 1).all())

@@ -1,6 +1,6 @@
 """Read labels and predictions: CSV, JSON Lines, Parquet, KITTI, MOTChallenge, CVAT, COCO and YOLO.
 
-A reader turns a file into records (cells by the name of their column) with the place of each for messages.
+A reader turns a file into columns of cells, with the place of each row for messages.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ _HIDDEN, _MAX_TRUNCATED, _MIN_WIDTH = 2, 0.7, 40.0
 _MIN_CONFIDENCE = 1e-6
 
 
-class Found(NamedTuple):
+class FileRows(NamedTuple):
     """Rows of a file."""
 
     places: list[str]  # file and line of each, for messages
@@ -81,11 +81,11 @@ class Found(NamedTuple):
     frames: Sequence[FrameKey] = ()  # that the file lists; they may have no row
 
 
-def _found(rows: Iterable[tuple[str, Record]], frames: Sequence[FrameKey] = ()) -> Found:
+def _rows_of_records(rows: Iterable[tuple[str, Record]], frames: Sequence[FrameKey] = ()) -> FileRows:
     """Collect records; a cell that a record lacks is missing."""
     places, records = zip(*listed) if (listed := list(rows)) else ((), ())
     names = dict.fromkeys(name for record in records for name in record) or BOX_COLUMNS[:-1]
-    return Found(list(places), {name: [record.get(name) for record in records] for name in names}, frames)
+    return FileRows(list(places), {name: [record.get(name) for record in records] for name in names}, frames)
 
 
 def _read_lines(file: Path, text: str | None = None) -> Iterator[tuple[str, str]]:
@@ -100,7 +100,7 @@ def _split_words(line: str) -> list[str]:
     return re.split(r"\s*,\s*|\s+", line.strip())
 
 
-def _read_csv(source: Path, classes: Collection[str] | None) -> Found:
+def _read_csv(source: Path, classes: Collection[str] | None) -> FileRows:
     text = read_text(source)
     separator = max(",;\t", key=text.split("\n", 1)[0].count)
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
@@ -121,10 +121,10 @@ def _read_csv(source: Path, classes: Collection[str] | None) -> Found:
     }
     if all(map(FRAME_NUMBER.fullmatch, cells.get("frame", ["no number"]))):
         cells["frame"] = [int(frame.partition(".")[0]) for frame in cells["frame"]]
-    return _checked(source, Found([f"{source} line {number}" for number, _ in lines], cells))
+    return _check_columns(source, FileRows([f"{source} line {number}" for number, _ in lines], cells))
 
 
-def _checked(source: Path, found: Found) -> Found:
+def _check_columns(source: Path, found: FileRows) -> FileRows:
     """Check that a table has the columns of labels, or those of predictions."""
     scores = found.cells.get("score")
     scored = scores is not None and not all(str(cell).lower() in ("", "nan", "none") for cell in scores)
@@ -141,7 +141,7 @@ def _checked(source: Path, found: Found) -> Found:
     return found
 
 
-def _read_json_lines(source: Path, classes: Collection[str] | None) -> Found:
+def _read_json_lines(source: Path, classes: Collection[str] | None) -> FileRows:
     rows: list[tuple[str, Record]] = []
     # Not splitlines, which also splits at other characters that a name may hold.
     for number, line in enumerate(read_text(source).split("\n"), 1):
@@ -153,10 +153,10 @@ def _read_json_lines(source: Path, classes: Collection[str] | None) -> Found:
                 raise DatasetError(f"{where}: not a JSON object ({json_reason(error)})") from None
             if not isinstance(rows[-1][1], dict):
                 raise DatasetError(f"{where}: expected a JSON object, found {line.strip()[:40]!r}")
-    return _checked(source, _found(rows)) if rows else _found(rows)
+    return _check_columns(source, _rows_of_records(rows)) if rows else _rows_of_records(rows)
 
 
-def _read_parquet(source: Path, classes: Collection[str] | None) -> Found:
+def _read_parquet(source: Path, classes: Collection[str] | None) -> FileRows:
     pyarrow = import_pyarrow()
     check_regular_file(source, str(source), Limit.TEXT_BYTES, error=DatasetError)
     try:
@@ -164,10 +164,10 @@ def _read_parquet(source: Path, classes: Collection[str] | None) -> Found:
     except (pyarrow.ArrowException, OSError) as error:
         raise DatasetError(f"{source} is not a Parquet file: {' '.join(str(error).split())}") from None
     places = [f"{source} row {number}" for number in range(table.num_rows)]
-    return _checked(source, Found(places, table.to_pydict()))
+    return _check_columns(source, FileRows(places, table.to_pydict()))
 
 
-def _read_kitti(source: Path, classes: Collection[str] | None) -> Found:
+def _read_kitti(source: Path, classes: Collection[str] | None) -> FileRows:
     files = list(source.glob("*.txt")) if source.is_dir() else [source]
     if not files:
         raise _no_text_files(source, "a KITTI label_2 folder or a label file")
@@ -176,10 +176,10 @@ def _read_kitti(source: Path, classes: Collection[str] | None) -> Found:
         for where, line in _read_lines(file):
             record = _kitti_record(where, line.split(), classes)
             if record is not None:
-                # An ignored box without a track would be a region.
+                # `ignore` with NO_TRACK means a region, so an ignored vehicle gets a track number of its own.
                 track = len(rows) if record["ignore"] and "occluded" in record else NO_TRACK
                 rows.append((where, {"frame": file.stem, "track_id": track, **record}))
-    return _found(rows, [file.stem for file in files])
+    return _rows_of_records(rows, [file.stem for file in files])
 
 
 def _no_text_files(folder: Path, expected: str) -> DatasetError:
@@ -210,14 +210,16 @@ def _kitti_record(where: str, words: list[str], classes: Collection[str] | None)
     return record | {"occluded": occluded, "truncated": truncated, "ignore": ignore}
 
 
-def _read_mot(source: Path, classes: Collection[str] | None) -> Found:
+def _read_mot(source: Path, classes: Collection[str] | None) -> FileRows:
     rows = list(_mot_rows(_read_lines(source)))
     if classes is not None and rows:
         found = {number for *_, number in rows if number is not None}
         if not found:
             raise DatasetError(f"{source} holds predictions, which have no classes; leave out classes=")
         check_classes(source, found, classes)
-    return _found((where, record) for where, record, number in rows if classes is None or number in classes)
+    return _rows_of_records(
+        (where, record) for where, record, number in rows if classes is None or number in classes
+    )
 
 
 def _mot_rows(
@@ -244,7 +246,7 @@ def _mot_rows(
             yield where, record | {"score": words[6] if len(words) > 6 else None}, None
 
 
-def _read_mot_zip(source: Path, classes: Collection[str] | None) -> Found:
+def _read_mot_zip(source: Path, classes: Collection[str] | None) -> FileRows:
     """Read an archive of CVAT: MOTChallenge text whose pixels count from 0, and the names of the classes."""
     text, names = _read_members(source, "gt/gt.txt", "gt/labels.txt")
     if text is None:
@@ -259,12 +261,13 @@ def _read_mot_zip(source: Path, classes: Collection[str] | None) -> Found:
             index = parse_number(number, "class", where)
             if index not in range(1, len(labels) + 1):
                 raise DatasetError(
-                    f"{where}: class must be at most {len(labels)}, as in gt/labels.txt, got {number}"
+                    f"{where}: class must be a whole number from 1 to {len(labels)}, as in gt/labels.txt, "
+                    f"got {number}"
                 )
             if labels[int(index) - 1] not in wanted:
                 continue
         rows.append((where, record))
-    return _found(rows)
+    return _rows_of_records(rows)
 
 
 def _read_members(source: Path, *names: str) -> list[str | None]:
@@ -287,7 +290,9 @@ def _read_members(source: Path, *names: str) -> list[str | None]:
         raise DatasetError(f"{source} does not hold UTF-8 text; save it as UTF-8") from None
 
 
-def _read_yolo(source: Path, classes: Collection[str] | None, shape: Any, images: FrameSet | None) -> Found:
+def _read_yolo(
+    source: Path, classes: Collection[str] | None, shape: Any, images: FrameSet | None
+) -> FileRows:
     """Read a text file for each frame; the names of the classes are beside their folder, or unknown."""
     if shape is None and images is None:
         raise InvalidInputError(
@@ -316,7 +321,7 @@ def _read_yolo(source: Path, classes: Collection[str] | None, shape: Any, images
                 rows.append((where, {"frame": key, **record}))
     if not names and classes is not None and numbers:
         check_classes(source, numbers, wanted)
-    return _found(rows, [key for key, _ in frames])
+    return _rows_of_records(rows, [key for key, _ in frames])
 
 
 def _yolo_frames(files: Sequence[Path], shape: Any) -> list[tuple[FrameKey, tuple[int, ...]]]:
@@ -399,6 +404,8 @@ def _yaml_names(file: Path) -> dict[str, str]:
     return {str(number): str(name).lower() for number, name in listed}
 
 
+# All have the same arguments; tables are filtered by class in `parse_cells`. The readers of COCO and YOLO
+# take more, and `read_labels` calls them.
 _READERS = {
     "csv": _read_csv,
     "jsonl": _read_json_lines,
@@ -424,12 +431,17 @@ def read_labels(
     Parameters
     ----------
     path
-        A CSV file (``frame,track,x1,y1,x2,y2[,occluded,truncated,ignore]``, where ``track_id`` may stand for
-        ``track``, or, for predictions, the columns of `write_tracks`; separated by commas, semicolons or
-        tabs; with a column ``class``, ``label`` or ``category`` of names, rows of other classes than vehicles
-        are left out), a JSON Lines or Parquet (needs pyarrow) file with these columns, a KITTI ``label_2``
-        folder, a MOTChallenge text file, the MOT archive of CVAT, a COCO JSON file, a list of COCO results,
-        or a YOLO folder: ``labels/*.txt``, with class names in ``data.yaml`` or ``classes.txt``.
+        One of these:
+
+        - a CSV file, separated by commas, semicolons or tabs: for labels
+          ``frame,track,x1,y1,x2,y2[,occluded,truncated,ignore]``, where ``track_id`` may stand for ``track``,
+          for predictions the columns of `write_tracks`; with a column ``class``, ``label`` or ``category`` of
+          names, rows of other classes than vehicles are left out;
+        - a JSON Lines or Parquet (needs pyarrow) file with these columns;
+        - a KITTI ``label_2`` folder or one of its files;
+        - a MOTChallenge text file, or the MOT archive of CVAT;
+        - a COCO JSON file, or a list of COCO results;
+        - a YOLO folder: ``labels/*.txt``, with class names in ``data.yaml`` or ``classes.txt``.
     format
         ``"csv"``, ``"jsonl"``, ``"parquet"``, ``"kitti"``, ``"mot"``, ``"mot_zip"``, ``"coco"``,
         ``"coco_results"`` or ``"yolo"``; None chooses by suffix and content.
@@ -448,9 +460,10 @@ def read_labels(
     -------
     TrackTable
         CSV frames are int if all of them are whole numbers, else str. KITTI frames are the files' names
-        without ``.txt``, COCO frames the images' ``file_name``. Frames and pixels of MOT files count from 1
-        and are returned from 0. YOLO frames are the files' names without ``.txt``, or numbers if all have six
-        digits, or with `images` the images' file names; a confidence becomes its log-odds.
+        without ``.txt``, COCO frames the images' ``file_name``. Frames of MOT files and of CVAT's archives
+        count from 1, as do the pixels of MOT files, but not those of the archives; all are returned from 0.
+        YOLO frames are the files' names without ``.txt``, or numbers if all have six digits, or with `images`
+        the images' file names; a confidence becomes its log-odds.
 
     Raises
     ------
@@ -462,8 +475,9 @@ def read_labels(
     -----
     KITTI's ``DontCare`` and COCO's crowds become regions; trams, trailers and the like become ignored boxes,
     as do KITTI's vehicles that are largely hidden, truncated by more than 0.7 or narrower than 40 px, the
-    same rule as in the project's labels. Persons and all other classes are left out. A MOT file with nine
-    columns is ground truth, whose rows with flag 0 are ignored; in others column seven is the score.
+    same rule as in the project's labels. Persons are left out. Other classes become ignored boxes in KITTI,
+    and are left out elsewhere. A MOT file with nine columns is ground truth, whose rows with flag 0 are
+    ignored; in others column seven is the score.
 
     Examples
     --------
@@ -489,7 +503,9 @@ def read_labels(
     if classes is not None:
         chosen = frozenset(str(name).lower() for name in check_sequence(classes, "classes", "names"))
     if kind in ("coco", "coco_results"):  # told apart by their content
-        found = _found(*read_coco(source, chosen, None if truth is None else check_path(truth, "truth")))
+        found = _rows_of_records(
+            *read_coco(source, chosen, None if truth is None else check_path(truth, "truth"))
+        )
     elif kind == "yolo":
         found, shape = _read_yolo(source, chosen, shape, pictures), None  # its boxes are clipped
     else:
@@ -498,7 +514,7 @@ def read_labels(
 
 
 def _table_of(
-    source: Path, found: Found, classes: Collection[str] | None, shape: tuple[int, ...] | None
+    source: Path, found: FileRows, classes: Collection[str] | None, shape: tuple[int, ...] | None
 ) -> TrackTable:
     """Check the rows of any format, clip their boxes to `shape`, and return them as a table."""
     columns, places = parse_cells(found.cells, source, found.places, classes)
@@ -511,12 +527,13 @@ def _table_of(
             f"{places[wrong[0]]}: a box needs x1 < x2 and y1 < y2, got {boxes[wrong[0]].tolist()}"
         )
     first: dict[tuple[FrameKey, int], str] = {}
-    for frame, track, place in zip(columns["frame"], columns.get("track_id", np.empty(0)).tolist(), places):
-        before = place if track == NO_TRACK else first.setdefault((frame, track), place)
-        if before != place:
-            raise DatasetError(
-                f"{place}: track {track} comes twice in frame {describe(frame)}, first at {before}"
-            )
+    if "track_id" in columns:
+        for frame, track, place in zip(columns["frame"], columns["track_id"].tolist(), places, strict=True):
+            before = place if track == NO_TRACK else first.setdefault((frame, track), place)
+            if before != place:
+                raise DatasetError(
+                    f"{place}: track {track} comes twice in frame {describe(frame)}, first at {before}"
+                )
     if shape is not None:
         columns["boxes"] = clip_boxes(boxes, shape)
         gone = np.flatnonzero((columns["boxes"][:, :2] == columns["boxes"][:, 2:]).any(axis=1))

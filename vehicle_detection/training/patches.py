@@ -68,8 +68,9 @@ class SplitScore:
 class TrainingReport:
     """Options and results of `train_and_evaluate`; `split` is the split whose accuracy is reported.
 
-    `seconds` are the times of each step, of which concurrent fits add up; `calibration_error` is that on the
-    split ``"sequences"``, None if it cannot be made twice.
+    `seconds`: work time per step; concurrent fits are summed, so the total may exceed the elapsed time.
+    `calibration_error`: on the test part of ``"sequences"``, with the sigmoid fitted on a second such split
+    of the training part; None if that split is impossible.
     """
 
     params: FeatureParams
@@ -121,9 +122,10 @@ def train_and_evaluate(
 ) -> tuple[VehicleClassifier, TrainingReport]:
     """Evaluate a classifier on several splits, then train it on all patches.
 
-    On each split, scaler and SVM are fitted on the training part and its copies, and evaluated on the
-    unchanged test part. Returns the classifier, whose metadata also hold the metrics and the patches' counts
-    and fingerprint, and a report with all results and the time of each step.
+    On each split, scaler and SVM are fitted on the training part and its mirrored and degraded copies
+    (`TrainingOptions`), and evaluated on the unchanged test part. Returns the classifier, whose metadata also
+    hold the metrics and the patches' counts and fingerprint, and a report with all results and the time of
+    each step.
 
     Parameters
     ----------

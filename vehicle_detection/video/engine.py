@@ -1,7 +1,7 @@
 """`track`: the one engine that processes a source: decode, search in parallel, track in order.
 
-The results do not depend on the number of workers. Only a few frames are in memory: those being searched, and
-those between two searched frames, which wait for their tracks.
+The results do not depend on the number of workers. In memory are the frames decoded ahead (`lookahead`),
+those between two searched frames, and those held back for backfilling (`delay`).
 """
 
 from __future__ import annotations
@@ -57,7 +57,11 @@ Frame = NDArray[np.uint8]
 
 
 class VideoDetector(Protocol):
-    """The methods of a detector that `track` calls, such as a `VehicleDetector`."""
+    """The methods of a detector that `track` calls, such as a `VehicleDetector`.
+
+    It may have two attributes: `searches_every_frame`, whether no frame may be skipped (True if missing), and
+    `track_params`, the `TrackParams` for backfilling (none if missing).
+    """
 
     def search(self, frame: Frame, /) -> Any:
         """Search one frame; called from several threads, and before earlier frames are tracked."""
@@ -129,7 +133,7 @@ class _QueuedFrame:
     frame: Frame | None  # None if nobody asked for it
     cut: bool  # whether it begins another scene
     search: Future[tuple[Any, float]] | None  # None: the frame is not searched
-    missed: int = 0  # frames that a live source dropped before this one
+    dropped: int = 0  # frames that a live source dropped before this one
 
 
 @dataclass
@@ -145,10 +149,10 @@ class _Searched:
 class _Plan:
     """What `track` is to do.
 
-    With an `interval` above 1, only every n-th frame and the first one of each scene are searched, and each
-    frame after a gap of a live source. The frames between wait for the next searched frame, and get
-    interpolated tracks. With a `delay` above 0, that many searched frames are held back, because a track
-    that is confirmed later is shown in them, too. Up to `lookahead` frames are decoded ahead.
+    Searched are: every n-th frame (`interval`), the first of each scene, and the first after dropped frames.
+    The frames between wait for the next searched frame, and get interpolated tracks. With a `delay` above 0,
+    that many searched frames are held back, because a track that is confirmed later is shown in them, too. Up
+    to `lookahead` frames are decoded ahead.
     """
 
     source: FrameSource
@@ -172,7 +176,7 @@ class _Pipeline:
     def __init__(self, plan: _Plan) -> None:
         self._plan, self._detector = plan, plan.detector
         self.stages: defaultdict[str, float] = defaultdict(float)
-        self.missed = 0  # frames that a live source dropped
+        self.dropped = 0  # frames that a live source dropped
         self.damage = ""  # what is damaged in the source; known after the last frame
         self._queue: ClosableQueue[_QueuedFrame] = ClosableQueue(plan.lookahead)
         self._pool = ThreadPoolExecutor(plan.workers, thread_name_prefix="vehicle-search")
@@ -235,14 +239,14 @@ class _Pipeline:
                 break
             cut = cuts.update(frame)
             skipped += 1
-            missed = index - expected if expected is not None else 0
+            dropped = index - expected if expected is not None else 0
             search = None
-            if expected is None or missed or cut or skipped >= self._plan.interval:
+            if expected is None or dropped or cut or skipped >= self._plan.interval:
                 search, skipped = self._pool.submit(self._search, frame), 0
             kept = frame if self._plan.frames else None
-            self._queue.put(_QueuedFrame(moment, kept, cut, search, missed))
+            self._queue.put(_QueuedFrame(moment, kept, cut, search, dropped))
             del frame, kept
-            self.missed += missed
+            self.dropped += dropped
             expected = index + 1
 
     def _search(self, frame: Frame) -> tuple[Any, float]:
@@ -260,7 +264,6 @@ class _Pipeline:
                 continue
             held.append(_Searched(waiting, item, self._track(item, waiting)))
             waiting = []
-            del item  # free the frame before waiting for the next one
             if delay:
                 results = backfill_results([searched.result for searched in held])
                 for searched, result in zip(held, results, strict=True):
@@ -281,7 +284,7 @@ class _Pipeline:
         except DetectorError as error:
             raise DetectorError(f"at {item.time:.2f} s: {error}") from error
         self.stages["search"] += seconds
-        frames = 1 + len(waiting) + item.missed
+        frames = 1 + len(waiting) + item.dropped
         return self._detector.track(found, time=item.time, frames=frames, cut=item.cut)
 
     def _release(self, before: Any, searched: _Searched) -> Iterator[Any]:
@@ -315,6 +318,7 @@ class TrackRun(Closing):
         self._total = plan.count or max(self.info.frames - plan.first, 0) or None
         self._pipeline = _Pipeline(plan)
         self._results = self._pipeline.run()
+        # Detector and source; bar and threads. After the last result the source stays open for the sound.
         self._on_close, self._on_end = on_close, contextlib.ExitStack()
         self._entered = self.stopped = False
         self._frames, self._track_ids = 0, set[int]()
@@ -377,7 +381,7 @@ class TrackRun(Closing):
             seconds=self._seconds or time.perf_counter() - self._started,
             stages=dict(stages),
             tracks=len(self._track_ids),
-            dropped=self._pipeline.missed,
+            dropped=self._pipeline.dropped,
             damage=self._pipeline.damage,
         )
 
