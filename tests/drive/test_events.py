@@ -215,6 +215,21 @@ def test_any_track_gives_consistent_events(seed, known, speed):
         assert all(math.isfinite(value) for value in vars(event).values() if isinstance(value, float))
 
 
+def test_speeds_of_an_overtaking_vehicle_are_of_one_moment():
+    seconds = np.arange(75) / 25
+    distance = np.where(seconds < 0.6, 9 - 0.5 * seconds, 8.7 + 8 * (seconds - 0.6))
+    height, middle = 1155 * 1.55 / distance, 640 - 1155 * 3 / distance
+    boxes = np.stack([middle - height / 2, 500 - height, middle + height / 2, 500 + 0 * height], axis=1)
+    boxes[:5, 0] = 0  # it comes in at the left border
+    table = TrackTable(np.arange(25, 100), np.ones(75, int), boxes)
+    speeds = np.arange(100.0)  # differ by 1 m/s from frame to frame
+    (event,) = find_events(table, fps=25, shape=SHAPE, own_speed_mps=speeds)
+    assert event.kind == "overtaking"
+    # The frame is that of the least distance, the speeds are of the first certain motion away.
+    assert round(event.speed_mps + event.closing_mps, 6) in speeds
+    assert round(event.speed_mps + event.closing_mps) < event.frame
+
+
 def test_a_camera_of_another_size_is_scaled_or_refused():
     table = simulated("cut_in", 0)[1]
     large = Camera.for_frame((2 * SHAPE[0], 2 * SHAPE[1]))

@@ -61,7 +61,7 @@ KINDS: dict[Kind, str] = {
 _MIN_TRACK, _MIN_FOLLOWING, _MIN_IN_LANE = 0.5, 2.0, 0.5
 # Largest relative error of a distance, a headway and a time to collision that is stated.
 _MAX_STD = 0.3
-# Largest relative error of a vehicle's growth that leaves no doubt about its sign.
+# Largest relative error of a growth rate whose sign is certain.
 _MAX_PASSING_STD = 0.5
 # Largest standard error (m/s) of a closing speed that is stated.
 _MAX_SPEED_STD = 5.0
@@ -75,12 +75,15 @@ _MIN_AROUND = 0.5
 # Longest duration (s) of a lane change, and its largest lateral speed (m/s): crossing vehicles, and all
 # vehicles while the camera turns, are faster.
 _LANE_CHANGE, _MAX_LATERAL_SPEED = 6.0, 3.0
-# Time (s) before it is beside the camera until which, or after it from which, a passing vehicle is seen; and
-# change of size that it must show.
+# A passing vehicle is last seen at most this long (s) before it is beside the camera, or first seen at most
+# this long after; and the least change of its size.
 _PASSING_TIME, _PASSING_RATIO = 2.5, 1.3
+# Time (s) at the start and the end of a track in which the side of the frame truncates a passing vehicle.
+_AT_SIDE_TIME = 0.3
 # Distance (m) to a passing vehicle where it is first or last seen.
 _PASSING_M = 25.0
-# Closing speeds (m/s) of vehicles that are overtaken and of oncoming ones, where the own speed is unknown.
+# Least closing speed (m/s) of an oncoming vehicle and greatest of an overtaken one, where the own speed is
+# unknown. Faster vehicles do not cut in.
 _SLOWEST_ONCOMING, _FASTEST_OVERTAKEN = 20.0, 14.0
 # Speed (m/s) over the road from which a vehicle moves.
 _MOVING = 2.0
@@ -105,7 +108,7 @@ class Event:
         Track of the vehicle; frame of the event, counted from 0 in the processed part of the video; and first
         and last frame that belong to it.
     time_s
-        Time of the event in seconds since the first processed frame.
+        `frame` divided by the frame rate: the time in the annotated copy, in seconds.
     side
         ``"left"`` or ``"right"`` of the camera, for vehicles that pass or cut in.
     distance_m, distance_std_m
@@ -118,7 +121,8 @@ class Event:
         Smallest time to collision at constant speeds, for the closing kinds.
     speed_mps
         Speed of the vehicle over ground in the camera's direction, negative when oncoming: own speed minus
-        `closing_mps`, where both are known.
+        `closing_mps`, where both are known. For ``"overtaking"`` both are those of the first frame in which
+        it certainly moves away.
     """
 
     kind: Kind
@@ -214,6 +218,8 @@ def find_events(
     rate = check_number(fps, "fps", above=0, high=1e6)
     frame_shape = check_shape(shape)
     if camera is None:
+        # Events use the focal length, which Camera.dashcam, the tracker's default, has too, but neither the
+        # horizon nor the errors of the lens, in which the two differ.
         camera = Camera.for_frame(frame_shape)
     check_type(camera, "camera", Camera, "omit it for a typical dash-cam")
     camera = camera.for_shape(frame_shape)
@@ -307,6 +313,7 @@ class _Finder:
             begin = before[-1] - 1
             if np.nanmedian(np.abs(motion.lateral_rate[begin : start + 1])) > _MAX_LATERAL_SPEED:
                 continue
+            # Where it went on to the other half of the lane, it crosses the road.
             crossed = motion.lateral[begin] * motion.lateral[start] < -(LANE_HALF_WIDTH_M**2)
             if crossed or self._moved_alike(motions, begin, start):
                 continue
@@ -320,32 +327,40 @@ class _Finder:
         own = self.motion
         change = own.lateral[end] - own.lateral[begin]
         changes = []
-        start, stop = own.seconds[[begin, end]]
+        begin_s, end_s = own.seconds[[begin, end]]
         for other in motions:
-            inside = (other.seconds >= start) & (other.seconds <= stop) & (other.at_side == 0)
+            inside = (other.seconds >= begin_s) & (other.seconds <= end_s) & (other.at_side == 0)
             rows = np.flatnonzero(inside)
             if other is own or not len(rows):
                 continue
-            if other.seconds[rows[-1]] - other.seconds[rows[0]] > 0.6 * (stop - start):
+            # The other track covers most of the lane change.
+            if other.seconds[rows[-1]] - other.seconds[rows[0]] > 0.6 * (end_s - begin_s):
                 changes.append(other.lateral[rows[-1]] - other.lateral[rows[0]])
+        # In the same direction, by at least half as much.
         return bool(changes) and float(np.median(changes)) / change > 0.5
 
     def passing(self, *, starts_late: bool) -> Iterable[Event]:
-        """Yield whether it was passed when it left the frame, or overtook when it came into the frame."""
+        """Yield its passing where it left the frame, and its overtaking where it came into the frame."""
         motion = self.motion
-        inverse = 1 / motion.distance
-        known = np.flatnonzero(np.isfinite(motion.time_to_collision) & np.isfinite(inverse))
+        has_distance = np.isfinite(motion.distance) & (motion.distance > 0)
+        known = np.flatnonzero(np.isfinite(motion.time_to_collision) & has_distance)
         if not known.size:
             return
         first, last = int(known[0]), int(known[-1])
         yield from self._left_behind(first, last)
-        if starts_late or motion.at_side[: max(int(0.3 * self.fps), 1)].any():
+        if starts_late or motion.at_side[: self._side_rows].any():
             yield from self._came_past(first, last)
 
+    @property
+    def _side_rows(self) -> int:
+        """Number of rows of the track that `_AT_SIDE_TIME` spans."""
+        return max(int(_AT_SIDE_TIME * self.fps), 1)
+
     def _left_behind(self, first: int, last: int) -> Iterable[Event]:
+        """Yield the passing of a vehicle that is beside the camera soon after its last known row."""
         motion = self.motion
         time, error = motion.time_to_collision[last], motion.slope_error[last]
-        ends_at_side = motion.at_side[-max(int(0.3 * self.fps), 1) :].any()
+        ends_at_side = motion.at_side[-self._side_rows :].any()
         if not 0 < time <= _PASSING_TIME or error > _MAX_PASSING_STD or not self._beside(last):
             return
         grown = np.nanmax(motion.distance[first : last + 1]) / motion.distance[last]
@@ -358,15 +373,16 @@ class _Finder:
         yield self._event(kind, last, int(rows[0]), last + 1, side=self._side(last))
 
     def _came_past(self, first: int, last: int) -> Iterable[Event]:
+        """Yield the overtaking of a vehicle that was beside the camera and then moved away."""
         motion = self.motion
         time = motion.time_to_collision
-        at_side = motion.at_side[: max(int(0.3 * self.fps), 1)].any()
-        # Where its motion away is certain for the first time, at most a few seconds after its first frame.
+        at_side = motion.at_side[: self._side_rows].any()
         sure = np.flatnonzero((time < 0) & (motion.slope_error < _MAX_PASSING_STD))
         near = first + int(np.nanargmin(motion.distance[first : first + max(round(self.fps), 1)]))
         if not sure.size or not self._beside(first) or motion.distance[near] > _PASSING_M:
             return
-        row = int(sure[0])
+        row = int(sure[0])  # first row where its motion away is certain
+        # It was beside the camera at most _PASSING_TIME before its first known row.
         recent = -time[row] - (motion.seconds[row] - motion.seconds[first]) <= _PASSING_TIME
         shrunk = motion.distance[last] / motion.distance[near]
         if shrunk >= _PASSING_RATIO and (at_side or recent):
@@ -375,6 +391,7 @@ class _Finder:
             )
 
     def _passing_kind(self, closing: float, std: float, frame: int) -> Kind:
+        """Kind of a vehicle that left the frame: by its speed over the road, else by its closing speed."""
         speed = float(self.own_speed[frame]) - closing  # over the road, in the camera's direction
         if math.isfinite(speed):
             if abs(speed) > max(_MOVING, std):
@@ -405,12 +422,19 @@ class _Finder:
         ]
 
     def _event(
-        self, kind: Kind, row: int, start: int, stop: int, *, side: Side | None = None, speed_row: int = -1
+        self,
+        kind: Kind,
+        row: int,
+        start: int,
+        stop: int,
+        *,
+        side: Side | None = None,
+        speed_row: int | None = None,
     ) -> Event:
-        """Describe an event at a row, whose speed is that at `speed_row`, by default the same."""
+        """Describe an event at a row, whose speeds are those at `speed_row`, by default the same."""
         motion, frames = self.motion, self.motion.track.frames
         frame, own_speed = int(frames[row]), self.own_speed[frames[row]]
-        values: dict[str, float | None] = dict.fromkeys(EVENT_COLUMNS[7:])
+        values: dict[str, float | None] = dict.fromkeys(EVENT_COLUMNS[7:])  # those after `side`
         distance, std = motion.distance[row], motion.distance_std[row]
         stated = motion.track.columns["distance_m"][row], motion.track.columns["distance_std_m"][row]
         if np.isfinite(stated).all():  # as labels and tables have it
@@ -419,12 +443,12 @@ class _Finder:
             values |= {"distance_m": distance, "distance_std_m": std}
             if kind == "headway" and own_speed > _MOVING:
                 values |= {"headway_s": distance / own_speed, "headway_std_s": std / own_speed}
-        speed_row = row if speed_row < 0 else speed_row
+        speed_row = row if speed_row is None else speed_row
         if motion.closing_std[speed_row] <= _MAX_SPEED_STD:
             closing = motion.closing[speed_row], motion.closing_std[speed_row]
             values |= dict(zip(("closing_mps", "closing_std_mps"), closing))
-            if math.isfinite(own_speed):
-                values["speed_mps"] = own_speed - closing[0]
+            speed = self.own_speed[frames[speed_row]] - closing[0]
+            values["speed_mps"] = speed if math.isfinite(speed) else None
         if kind in ("closing", "hard_closing"):
             time_to_collision = motion.time_to_collision[row], motion.time_to_collision_std[row]
             values |= dict(zip(("ttc_s", "ttc_std_s"), time_to_collision))
