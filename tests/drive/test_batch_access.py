@@ -4,11 +4,13 @@ import contextlib
 import http.server
 import os
 import threading
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
 from tests.drive.batch_helpers import check_whole, counts, files, records, run
+from vehicle_detection import run_batch
 from vehicle_detection.drive import batch_plan as plan
 from vehicle_detection.drive import batch_trip as trip
 from vehicle_detection.drive.batch_plan import list_videos
@@ -213,3 +215,17 @@ def test_the_identity_of_a_url_does_not_depend_on_what_is_hidden_in_its_record()
     task = plan.plan_trip(found, {url: {"size": 1}}, {"options": {}}, "")
     assert task["key"].partition("-")[0] == plan.source_id(url) == plan.trip_id(found)
     assert "secret" not in task["sources"][0]["uri"]
+
+
+def test_the_message_of_a_broken_executor_has_no_password(one, model, tmp_path):
+    class Broken(ThreadPoolExecutor):
+        def submit(self, *_):
+            raise BrokenExecutor("tcp://anna:secret@host:8786 does not answer")
+
+    out = tmp_path / "out"
+    report = run_batch(one, out, Broken(1), model=model, tracks_only=True, progress=False)
+    assert counts(report) == (0, 0, 1, 0)
+    (message,) = report.messages.values()
+    assert "does not answer" in message
+    assert "secret" not in message
+    assert not records(out)

@@ -34,6 +34,7 @@ from vehicle_detection.drive.batch_plan import (
     Facts,
     fingerprint_of,
     group_files,
+    identity_of,
     list_videos,
     plan_trip,
     shipped_model,
@@ -85,7 +86,8 @@ class BatchReport:
     trips
         Number of trips of the sources (of this shard).
     done, failed, errors
-        Numbers of trips that were processed, whose source is bad, and that the next run repeats.
+        Numbers of trips that were processed; that failed because their source is bad; and that the next run
+        repeats.
     skipped
         Number of trips that an earlier or another run completed or found to have failed.
     frames, seconds
@@ -227,16 +229,16 @@ def run_batch(
             warm = warm_up, (settings, fingerprint_of(settings))
             executor = stack.enter_context(WorkerPool(min(workers, len(pending)), warm))
         bar = stack.enter_context(progress_bar(progress, len(pending), unit="trip", interactive_only=True))
-        for made in stack.enter_context(contextlib.closing(_run(executor, pending, store))):
+        for record in stack.enter_context(contextlib.closing(_run(executor, pending, store))):
             bar.update()
-            counts[made["status"] if made["new"] else "skipped"] += 1
-            if not made["new"]:
+            counts[record["status"] if record["new"] else "skipped"] += 1
+            if not record["new"]:
                 continue
-            counts["frames"] += made.get("frames", 0)
-            if made["status"] != DONE:
-                messages[made["sources"][0]["uri"]] = made["message"]
+            counts["frames"] += record.get("frames", 0)
+            if record["status"] != DONE:
+                messages[record["sources"][0]["uri"]] = record["message"]
             if on_record is not None:
-                on_record(made)
+                on_record(record)
     numbers = {name: counts[status] for name, status in COUNTS.items()}
     numbers |= {"trips": len(tasks), "skipped": counts["skipped"], "frames": counts["frames"]}
     seconds = time.perf_counter() - started
@@ -308,7 +310,7 @@ def _plan(
     fingerprint = fingerprint_of(settings)
     earlier: dict[str, list[str]] = {}  # keys of records by the identity of their trip
     for key in record_keys(store):
-        earlier.setdefault(key.partition("-")[0], []).append(key)
+        earlier.setdefault(identity_of(key), []).append(key)
     number, count = part
     tasks = []
     mine = [trip for trip in trips if int(trip_id(trip), 16) % count == number - 1]
@@ -321,7 +323,7 @@ def _plan(
         # A trip replaces the earlier ones that began with one of its files.
         ids = (source_id(str(file)) for file in trip.files)
         keys = [key for each in ids for key in earlier.get(each, ())]
-        task["recorded"] = task["key"] in earlier.get(task["key"].partition("-")[0], ())
+        task["recorded"] = task["key"] in earlier.get(identity_of(task["key"]), ())
         task["replaces"] = [key for key in keys if key != task["key"]]
         tasks.append(task)
     return tasks
@@ -338,11 +340,12 @@ def _is_result(file: str, store: Store) -> bool:
 def _longer_records(
     plans: Iterable[Mapping[str, Any]], earlier: Mapping[str, Sequence[str]], store: Store
 ) -> dict[str, dict[str, Any]]:
-    """Find complete records of trips whose first segments are gone, by each of their other segments.
+    """Complete records of the same days and cameras, by each of their segments but the first.
 
-    A camera that records in a loop deletes its oldest files.
+    A trip that starts at such a segment may be the rest of a longer one: a camera that records in a loop
+    deletes its oldest files.
     """
-    new = [plan for plan in plans if plan["key"].partition("-")[0] not in earlier]
+    new = [plan for plan in plans if identity_of(plan["key"]) not in earlier]
     if not new or not earlier:
         return {}
     # Records are read only of the same days and cameras: there may be very many.
@@ -367,8 +370,10 @@ def _without_recorded(
         return trip, plan
     held = sum(1 for _ in takewhile(record["sources"].__contains__, plan["sources"]))
     if held == len(trip.files):
+        # All of it is held: with that key, `_pending` skips the trip.
         return trip, plan | {"key": record["key"]}
-    rest = replace(trip, files=trip.files[held:], start=find_trips([trip.files[held]])[0].start)
+    start = find_trips([trip.files[held]])[0].start  # of the first file that is left
+    rest = replace(trip, files=trip.files[held:], start=start)
     return rest, plan_trip(rest, listed, settings, fingerprint)
 
 
@@ -377,7 +382,7 @@ def _pending(
 ) -> tuple[list[dict[str, Any]], list[tuple[dict[str, Any], dict[str, Any]]]]:
     """Select the trips that are missing, incomplete or, with `retry_failed`, have failed.
 
-    Also returns complete ones with their records that have replaced others, which are still there.
+    Also returns complete trips, with their records, that still have earlier results to be removed.
     """
     records = read_records(store, (task["key"] for task in tasks if task["recorded"]))
     outputs = {path for kind in ("tracks", "videos") for path in store.list_files(kind)} if records else set()
@@ -394,7 +399,7 @@ def _pending(
 
 def _run(
     executor: Executor | None, pending: Iterable[dict[str, Any]], store: Store
-) -> Generator[Mapping[str, Any]]:
+) -> Generator[dict[str, Any]]:
     """Yield the record of each trip; closing it cancels those that have not begun."""
     attempts: Counter[str] = Counter()
     running: dict[Future[Any], dict[str, Any]] = {}
@@ -414,6 +419,7 @@ def _run(
             future = finished.get()
             task = running[future]
             record = _outcome(future, task, attempts, store)
+            # Not before: if the pool is broken, `_outcome` raises, and the task must still be in `running`.
             del running[future]
             if record is None:
                 waiting.append(task)
@@ -423,7 +429,8 @@ def _run(
                 yield record
     except BrokenExecutor as error:  # such as a scheduler that was killed: the next run does the rest
         for task in (*waiting, *running.values(), *busy):
-            yield _error_record(task, f"{error}") | {"new": True}
+            # Not recorded: a trip without a record is repeated.
+            yield _error_record(task, hide_credentials(f"{error}")) | {"new": True}
     finally:
         for future in running:
             future.cancel()

@@ -167,6 +167,11 @@ def plan_trip(
     }
 
 
+def identity_of(key: str) -> str:
+    """Identity of the trip with a key: its first part, the `source_id` of the first file."""
+    return key.partition("-")[0]
+
+
 def trip_digest(sources: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], fingerprint: str) -> str:
     """Hash of everything that the results of a trip depend on: the second part of its key."""
     facts = [sources, dict(settings), fingerprint, __version__]

@@ -89,7 +89,7 @@ class Store:
         self._folder = None if is_url(name) else Path(name)
         self._shown = hide_credentials(name)
         # A path may look like a URL with two schemes, "a::b".
-        self._files, root = open_filesystem("file://" if self._folder else name, "out")
+        self._filesystem, root = open_filesystem("file://" if self._folder else name, "out")
         self._root = name if self._folder else root.rstrip("/")
 
     def _request(self, what: str, request: Callable[[], Result]) -> Result:
@@ -111,8 +111,8 @@ class Store:
         """Whether there is a file."""
 
         def find() -> None:
-            self._files.invalidate_cache()
-            self._files.info(self._path(path))
+            self._filesystem.invalidate_cache()
+            self._filesystem.info(self._path(path))
 
         try:
             self._request(f"/{path} cannot be found", find)
@@ -123,7 +123,7 @@ class Store:
     def read(self, path: str) -> bytes | None:
         """Content of a file; None if there is none."""
         # `cat_file` takes ten times as long for each of many thousand small local files.
-        read_file = _read_file if self._folder else self._files.cat_file
+        read_file = _read_file if self._folder else self._filesystem.cat_file
         try:
             data: bytes = self._request(f"/{path} cannot be read", lambda: read_file(self._path(path)))
         except FileNotFoundError:
@@ -135,22 +135,24 @@ class Store:
         wanted = {self._path(path): path for path in paths}
         found: dict[str, Any] = {}
         if wanted and not self._folder:
-            found = self._request(" cannot be read", lambda: self._files.cat([*wanted], on_error="return"))
+            read_all = functools.partial(self._filesystem.cat, [*wanted], on_error="return")
+            found = self._request(" cannot be read", read_all)
         for place, path in wanted.items():
             data = found.get(place)
-            if not isinstance(data, bytes):  # one of many has failed
+            if not isinstance(data, bytes):  # a local file, or one of many that has failed
                 data = self.read(path)
             if data is not None:
                 yield path, data
 
     def list_files(self, folder: str, prefix: str = "") -> list[str]:
         """Paths of the files in a folder and below, whose names start with `prefix` and are not hidden."""
-        # By default, a folder that cannot be read counts as empty.
+        # By default, a folder that cannot be read counts as empty. Remote storages have no such folders, and
+        # may not know the option.
         options = {"on_error": "raise"} if self._folder else {}
 
         def find() -> list[str]:
-            self._files.invalidate_cache()
-            return [str(name) for name in self._files.find(self._path(folder), **options)]
+            self._filesystem.invalidate_cache()
+            return [str(name) for name in self._filesystem.find(self._path(folder), **options)]
 
         try:
             names = self._request(f"/{folder} cannot be listed", find)
@@ -164,12 +166,12 @@ class Store:
     def publish(self, file: Path, path: str) -> None:
         """Copy a complete local file."""
         copy = functools.partial(shutil.copyfile, file)
-        self._put(path, copy, functools.partial(self._files.put_file, str(file)))
+        self._put(path, copy, functools.partial(self._filesystem.put_file, str(file)))
 
     def write(self, path: str, data: bytes) -> None:
         """Write a small file."""
         self._put(
-            path, lambda part: part.write_bytes(data), lambda target: self._files.pipe_file(target, data)
+            path, lambda part: part.write_bytes(data), lambda target: self._filesystem.pipe_file(target, data)
         )
 
     def _put(self, path: str, copy: Callable[[Path], object], upload: Callable[[str], object]) -> None:
@@ -184,20 +186,20 @@ class Store:
             self._request(what, lambda: upload(target))
         except FileNotFoundError:  # object stores need no folders, other storages do
             folder = target.rpartition("/")[0]
-            self._request(what, lambda: self._files.makedirs(folder, exist_ok=True))
+            self._request(what, lambda: self._filesystem.makedirs(folder, exist_ok=True))
             self._request(what, lambda: upload(target))
 
     def remove(self, path: str) -> None:
         """Remove a file, if it is there."""
         with contextlib.suppress(FileNotFoundError):
-            self._request(f"/{path} cannot be removed", lambda: self._files.rm_file(self._path(path)))
+            self._request(f"/{path} cannot be removed", lambda: self._filesystem.rm_file(self._path(path)))
 
     @contextlib.contextmanager
     def lock(self, name: str) -> Iterator[bool]:
-        """Lock a name against other processes during a block; yields whether that was possible.
+        """Lock a name against other processes during a block; yields False if another process holds it.
 
-        The system unlocks the file when the process ends in any way. Remote storage has no locks: two runs
-        may do a trip twice, and each file is that of one of them.
+        The system unlocks the file when the process ends in any way. Remote storage and Windows have no
+        locks: always True. Two runs may then do a trip twice, and each file is that of one of them.
         """
         if self._folder is None or sys.platform == "win32":
             yield True
@@ -209,6 +211,7 @@ class Store:
             try:
                 handle = open_locked(path)
                 if handle is not None:  # the file system has locks
+                    # Last in, first out: removed while still locked.
                     stack.callback(os.close, handle)
                     stack.callback(path.unlink, missing_ok=True)
             except BlockingIOError:
@@ -301,7 +304,10 @@ def write_record(store: Store, record: Mapping[str, Any]) -> None:
 
 
 def is_complete(record: Mapping[str, Any] | None, exists: Callable[[str], bool]) -> bool:
-    """Whether a trip need not be processed again: its outputs exist, or its source is known to be bad."""
+    """Whether a trip need not be processed again: its outputs exist, or its source is known to be bad.
+
+    The record of a bad source (`FAILED`) has no outputs, so that none can be missing.
+    """
     if record is None or record["status"] == ERROR:
         return False
     return all(map(exists, record.get("outputs", {}).values()))

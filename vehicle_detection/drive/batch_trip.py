@@ -26,7 +26,7 @@ from vehicle_detection._common import (
 from vehicle_detection.annotator import Annotator
 from vehicle_detection.camera import open_camera
 from vehicle_detection.detector import VehicleDetector, load_model
-from vehicle_detection.drive.batch_plan import fingerprint_of
+from vehicle_detection.drive.batch_plan import fingerprint_of, identity_of
 from vehicle_detection.drive.batch_store import (
     DONE,
     ERROR,
@@ -109,7 +109,7 @@ def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
     last.
     """
     store, key = open_store(task["out"], create=True), task["key"]
-    with store.lock(key.partition("-")[0]) as locked:
+    with store.lock(identity_of(key)) as locked:
         if not locked:
             return {"key": key, "status": BUSY, "sources": task["sources"]}
         record = read_records(store, [key]).get(key)
@@ -141,7 +141,7 @@ def _failure(error: Exception) -> dict[str, Any]:
 
 def remove_replaced(store: Store, task: Mapping[str, Any], record: Mapping[str, Any]) -> None:
     """Remove what a complete trip has replaced, which another run may have written in the meantime."""
-    with store.lock(task["key"].partition("-")[0]) as locked:
+    with store.lock(identity_of(task["key"])) as locked:
         if locked:
             _remove_earlier(store, task, record)
 
@@ -280,7 +280,7 @@ def _remove_earlier(store: Store, task: Mapping[str, Any], facts: Mapping[str, A
     if failed:
         return
     # Outputs of another run at the same time, or of a killed process that has not written their record.
-    identity, place = task["key"].partition("-")[0], f"date={task['date']}/camera={task['camera']}"
+    identity, place = identity_of(task["key"]), f"date={task['date']}/camera={task['camera']}"
     for kind in ("tracks", "videos"):
         for path in store.list_files(f"{kind}/{place}", f"{identity}-"):
             if path not in outputs.values():
