@@ -140,7 +140,12 @@ _KERNELS = {
     "spatial_cells": "spatial bins",
 }
 _MODULES = {"cv2": {"resize": "spatial bins"}}
-_FUNCTIONS = {"resize_band": "resize", "convert_color": "color", "hog_cells": "HOG cells", "_hits": "hits"}
+_FUNCTIONS = {
+    "resize_band": "resize",
+    "convert_color": "color",
+    "fill_hog_cells": "HOG cells",
+    "_hits": "hits",
+}
 
 
 @contextlib.contextmanager

@@ -90,12 +90,12 @@ class PixelBand:
 
 @dataclass(frozen=True, kw_only=True)
 class SearchBand(Checked):
-    """Windows of one size in a horizontal band, in pixels of a 1280-wide reference frame.
+    """Windows of one size in a horizontal band, in pixels of a frame whose longer side is 1280.
 
     Attributes
     ----------
     window, overlap
-        Width and height of the windows, and the overlap of neighbors as fractions of these, in [0, 1).
+        Width and height of the windows, and the overlap of neighbors as fractions of these, 0 to 0.99.
     y, x
         Top and bottom of the band relative to the horizon, positive downwards; left and right end as
         fractions of the frame's width, 0-1.
@@ -176,7 +176,11 @@ class SearchParams(Checked):
 
     @classmethod
     def preset(cls, name: str = "default") -> SearchParams:
-        """Return "default", or "130-windows" or "three-scales" of the course's first or third system."""
+        """Return the preset of this name; "default" suits any dash-cam.
+
+        `"130-windows"` are the windows of the course's first system, `"three-scales"` those of the third
+        (docs/results.md).
+        """
         presets = {"three-scales": _three_scales, "130-windows": _window_list, "default": _default_bands}
         check_choice(name, "preset", presets)
         return presets[name]()
@@ -216,6 +220,7 @@ class SearchParams(Checked):
 
 
 def _window_list() -> SearchParams:
+    """Four sizes of windows, each with its band and overlap, in the right half of the frame."""
     table = (
         ((96.0, 96.0), (-5.0, 130.0), (0.9, 0.5)),
         ((110.0, 145.0), (-20.0, 190.0), (0.7, 0.6)),
@@ -227,6 +232,7 @@ def _window_list() -> SearchParams:
 
 
 def _three_scales() -> SearchParams:
+    """Windows of 96, 64 and 51 pixels in steps of an eighth, in the 256 rows below the horizon."""
     bands = tuple(SearchBand(window=(64 * s, 64 * s), y=(0.0, 256.0)) for s in (1.5, 1.0, 0.8))
     return SearchParams(bands=bands, horizon=400 / 720)
 
@@ -235,8 +241,9 @@ def _default_bands() -> SearchParams:
     """Windows from 64 pixels up, in steps of 1.25, wherever a vehicle on a flat road may be.
 
     With the camera `c` meters above the road, the bottom of a vehicle whose face fills 0.84 of a window of
-    side `s` is ``0.84 * s * c / 1.8`` below the horizon. For cameras at 0.9 to 2 m the window is between
-    -0.35 `s` and 0.95 `s`; the margin allows for hills and an inexact horizon.
+    side `s` is ``0.84 * s * c / 1.8`` below the horizon, and 0.855 `s` below the window's top
+    (`RegionParams`). For cameras at 1.1 to 1.7 m the window is between -0.35 `s` and 0.95 `s`; the margin
+    allows for other heights, hills and an inexact horizon.
     """
     sides = [64.0 * 1.25**step for step in range(8)]
     bands = tuple(SearchBand(window=(side, side), y=(-0.35 * side - 16, 0.95 * side + 16)) for side in sides)
@@ -393,12 +400,13 @@ def _hits(
     return boxes, grid[rows, columns].astype(np.float64)
 
 
-def hog_cells(
+def fill_hog_cells(
     image: NDArray[Any], orient: int, cell: int, transform_sqrt: bool, cells: NDArray[np.float32]
 ) -> None:
     """Fill ``(channels, orient, rows, columns)`` float32 with the orientation histograms of an image's cells.
 
     Equals the first stage of scikit-image's HOG; `image` is ``(H, W, channels)``, uint8 or float.
+    Without `transform_sqrt`, a gradient of floats exactly on a bound of bins may fall into the other one.
     """
     channels = image.shape[2]
     if transform_sqrt:
@@ -415,14 +423,18 @@ def hog_cells(
 
 
 class BandFilters:
-    """Affine functions of a feature vector, each ``(weights, bias)``, as filters over cells."""
+    """Affine functions of a feature vector, each ``(weights, bias)``, as filters over cells.
+
+    The reference is `course.reference.score_windows`.
+    """
 
     def __init__(self, params: FeatureParams, functions: Sequence[tuple[NDArray[np.float64], float]]) -> None:
         self.params = params
         _check_shareable(params)
-        self.cells = params.cells
+        self.cells_per_window = params.cells  # along a side
         self.block = params.cell_per_block
-        self.per_cell = params.spatial_size // params.cells
+        self.bins_per_cell = params.spatial_size // params.cells
+        # Look up weights by pixel value, or, as roots of counts are not linear in these, count each window.
         self.hist_roots = params.hist_feat and params.hist_sqrt
         self.hist_lookup = params.hist_feat and not params.hist_sqrt
         self.coarse = params.coarse_blocks if params.hog_feat else 0
@@ -437,8 +449,9 @@ class BandFilters:
 
     def _build_filters(self, weights: NDArray[np.float64]) -> list[Filter]:
         """Build the filters of one template: over HOG, over coarse HOG, over spatial bins and histogram."""
-        params, cells = self.params, self.cells
+        params, cells, bins = self.params, self.cells_per_window, self.bins_per_cell
         filters = []
+        # The vector is spatial bins, histogram, HOG, coarse HOG.
         if params.hog_feat:
             start, stop = params.length - params.hog_length, params.length - params.coarse_length
             for positions, part, dilation in (
@@ -446,12 +459,16 @@ class BandFilters:
                 (self.coarse, weights[stop:], 2),
             ):
                 if positions:
+                    # (channel, block row, block column, values in the block) to
+                    # (block row, block column, channel and values), the order of `_hog_maps`.
                     blocks = part.reshape(params.hog_channels, positions, positions, -1).transpose(1, 2, 0, 3)
                     filters.append(Filter(blocks.reshape(positions, positions, -1), dilation=dilation))
         values = []
         if params.spatial_feat:
             planes = params.spatial_planes(weights[: params.spatial_length])
-            part = planes.reshape(3, cells, self.per_cell, cells, self.per_cell)
+            # (color, cell row, bin row, cell column, bin column) to
+            # (cell row, cell column, color, bin row, bin column).
+            part = planes.reshape(3, cells, bins, cells, bins)
             values.append(part.transpose(1, 3, 0, 2, 4).reshape(cells, cells, -1))
         if self.hist_lookup:
             values.append(np.ones((cells, cells, 1)))
@@ -484,17 +501,19 @@ class BandFilters:
         rows, columns = spatial.shape[0] // cell, spatial.shape[1] // cell
         if self.params.spatial_feat or self.hist_lookup:
             maps.append(self._value_map(spatial, workspace))
-        shape = (len(self.filters), rows - self.cells + 1, columns - self.cells + 1)
+        side = self.cells_per_window
+        shape = (len(self.filters), rows - side + 1, columns - side + 1)
         scores = np.empty(shape, np.float32)
         for template, (filters, bias) in enumerate(zip(self.filters, self.biases)):
             scores[template] = bias
             if tables is not None:
+                # The last channel of the last map is the histogram's; each template fills it again.
                 kernels.histogram_cells(hist, tables[template], cell, maps[-1][-1])
             for template_filter, channels in zip(filters, maps):
                 template_filter.add_to(channels, scores[template], workspace)
         if self.hist_roots:
             weights = self.weights_by_bin
-            kernels.add_root_histograms(hist, self.bins, weights, cell, self.cells, scores)
+            kernels.add_root_histograms(hist, self.bins, weights, cell, side, scores)
         return scores[0] if len(scores) == 1 else np.asarray(scores.max(axis=0))
 
     def _hog_maps(self, source: NDArray[Any] | None, workspace: Workspace) -> list[NDArray[np.float32]]:
@@ -504,7 +523,7 @@ class BandFilters:
         params, cell = self.params, self.params.pix_per_cell
         rows, columns, channels = source.shape[0] // cell, source.shape[1] // cell, source.shape[2]
         cells = workspace.take((channels, params.orient, rows, columns), np.float32, "cells")
-        hog_cells(source, params.orient, cell, params.transform_sqrt, cells)
+        fill_hog_cells(source, params.orient, cell, params.transform_sqrt, cells)
         shape = (channels, self.block, self.block, params.orient, rows, columns)
         blocks = workspace.take(shape, np.float32, "blocks")
         kernels.normalize_blocks(cells, self.block, 1, blocks)
@@ -519,7 +538,7 @@ class BandFilters:
 
     def _value_map(self, image: NDArray[Any], workspace: Workspace) -> NDArray[np.float32]:
         """Spatial bins of each cell ``(channels, rows, columns)`` and, last, a channel for the histogram."""
-        cell, per_cell = self.params.pix_per_cell, self.per_cell
+        cell, per_cell = self.params.pix_per_cell, self.bins_per_cell
         rows, columns = image.shape[0] // cell, image.shape[1] // cell
         count = 3 * per_cell**2 if self.params.spatial_feat else 0
         channels = workspace.take((count + int(self.hist_lookup), rows, columns), np.float32, "values")

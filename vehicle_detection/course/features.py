@@ -32,7 +32,7 @@ from vehicle_detection._kernels import features as kernels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import COLOR_SPACES, PATCH_SIZE, SPATIAL_ORDERS, FeatureParams
 from vehicle_detection.images import read_image
-from vehicle_detection.search import hog_cells
+from vehicle_detection.search import fill_hog_cells
 
 Image = NDArray[Any]
 Images = list[Image] | NDArray[Any]
@@ -311,7 +311,7 @@ def hog_blocks(
             f"img must be at least one block large ({side}x{side} pixels); got {width}x{height}"
         )
     cells = np.empty((channels, orient, height // cell, width // cell), np.float32)
-    hog_cells(image, orient, cell, transform_sqrt, cells)
+    fill_hog_cells(image, orient, cell, transform_sqrt, cells)
     blocks = np.empty((channels, block, block, *cells.shape[1:]), np.float32)
     kernels.normalize_blocks(cells, block, 1, blocks)
     rows, columns = (count - block + 1 for count in cells.shape[2:])
