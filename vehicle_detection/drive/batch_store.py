@@ -146,7 +146,7 @@ class Store:
 
     def list_files(self, folder: str, prefix: str = "") -> list[str]:
         """Paths of the files in a folder and below, whose names start with `prefix` and are not hidden."""
-        # By default, a folder that cannot be read counts as empty. Remote storages have no such folders, and
+        # By default, a folder that cannot be read counts as empty. Object stores have no such folders, and
         # may not know the option.
         options = {"on_error": "raise"} if self._folder else {}
 
