@@ -6,6 +6,7 @@ import pytest
 
 from tests.cli.commands import contents, refuse, refuse_each, run
 from tests.helpers import drawn, write_frame_set
+from vehicle_detection import training
 
 
 @pytest.fixture(scope="module")
@@ -20,6 +21,7 @@ def test_without_pytorch_the_command_names_the_extra(roads, tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, "torch", None)
     for name in "fine_tune", "export", "architecture", "network", "loss", "weights":
         monkeypatch.delitem(sys.modules, f"vehicle_detection.training.{name}", raising=False)
+    monkeypatch.delitem(vars(training), "fine_tune_network", raising=False)
     message = refuse("train-frames", roads, "-o", tmp_path / "own.onnx")
     assert "needs the package torch, which is not installed" in message
     assert 'pip install "vehicle-detection[train]"' in message

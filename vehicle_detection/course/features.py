@@ -457,7 +457,7 @@ def extract_features(
     >>> [len(vector) for vector in extract_features(images, cspace="HLS", orient=9)]
     [1764, 1764]
     """
-    options, read = FeatureOptions.of(locals()), imread or _read_like_lesson
+    options, read = FeatureOptions.of(locals()), _read_like_lesson if imread is None else imread
     if not is_listing(imgs):
         raise InvalidInputError(f"imgs must be a list of file names or images; got {describe(imgs)}")
     if isinstance(imgs, np.ndarray) and imgs.ndim in (2, 3) and imgs.dtype.kind in "uif":
