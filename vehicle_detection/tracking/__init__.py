@@ -7,8 +7,9 @@ from vehicle_detection.tracking.interpolation import (
     search_delay,
     search_interval,
 )
+from vehicle_detection.tracking.scene_cuts import SceneCuts
 from vehicle_detection.tracking.track import FrameResult, Track, TrackParams, is_result, shown_tracks
-from vehicle_detection.tracking.tracker import SceneCuts, Tracker
+from vehicle_detection.tracking.tracker import Tracker
 
 __all__ = [
     "FrameResult",
