@@ -86,8 +86,14 @@ class Camera(Checked):
         vehicles it tracks, with this prior.
     height_m
         Height of the lens above the road.
-    vehicle_width_m, vehicle_width_std_m, vehicle_height_m
-        Mean width of vehicles, its standard deviation, and their mean height.
+    vehicle_width_m, vehicle_width_std_m, mean_width_std_m
+        Mean width of vehicles, its standard deviation, and the standard error of the mean, which differs
+        between countries and which the tracker estimates from the vehicles of a video.
+    vehicle_height_m
+        Mean height of vehicles.
+    overhang_m, overhang_std_m
+        Mean distance between a vehicle's nearest part and its tyres, where its box ends, and its standard
+        deviation.
     vehicle_length_m, vehicle_length_std_m
         Mean length of the visible side of vehicles in other lanes, and its standard deviation.
     bottom_std_px, pitch_std_px
@@ -118,9 +124,12 @@ class Camera(Checked):
     horizon_px: float = number(low=-1e6, high=1e6)
     horizon_std_px: float = number(0.0, low=0, high=1e6)
     height_m: float = number(1.3, above=0, high=1e6)
-    vehicle_width_m: float = number(1.8, above=0, high=1e6)
-    vehicle_width_std_m: float = number(0.25, low=0, high=1e6)
+    vehicle_width_m: float = number(1.78, above=0, high=1e6)
+    vehicle_width_std_m: float = number(0.2, low=0, high=1e6)
+    mean_width_std_m: float = number(0.1, low=0, high=1e6)
     vehicle_height_m: float = number(1.5, above=0, high=1e6)
+    overhang_m: float = number(0.85, low=0, high=1e6)
+    overhang_std_m: float = number(0.2, low=0, high=1e6)
     vehicle_length_m: float = number(4.5, low=0, high=1e6)
     vehicle_length_std_m: float = number(0.8, low=0, high=1e6)
     bottom_std_px: float = number(2.5, low=0, high=1e6)

@@ -8,6 +8,7 @@ a vehicle is visible, and its error is relative to ``camera.vehicle_length_m``.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ _MAX_ASPECT = 1.5
 
 def initiate_states(mean: Floats, cov: Floats, camera: Camera) -> KalmanStates:
     """Return the states of new tracks, whose distance is unknown, from those of their boxes."""
-    count, width_std = len(mean), camera.vehicle_width_std_m / camera.vehicle_width_m
+    count, width_std = len(mean), math.hypot(camera.vehicle_width_std_m, camera.mean_width_std_m) / camera.vehicle_width_m
     length_std = camera.vehicle_length_std_m
     range_std = np.array([_INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD, width_std, length_std])
     range_mean = np.tile([_INITIAL_DISTANCE, 0.0, 0.0, 0.0], (count, 1))
@@ -105,7 +106,7 @@ def update_distances(
         whole = width_visible & ~is_bound
         # Linearize at the first measurement itself.
         below = bottom_visible & (below_horizon > 2 * np.hypot(edge_std[:, 1], horizon_std))
-        by_bottom = bottom_scale / np.where(below, below_horizon, 1.0)
+        by_bottom = bottom_scale / np.where(below, below_horizon, 1.0) - camera.overhang_m
         # The measurement with the smaller relative error.
         bottom_error = np.hypot(edge_std[:, 1], horizon_std) / np.where(below, below_horizon, 1.0)
         width_error = np.sqrt(cov[:, 2, 2] + np.square(lateral_px / width_scale) * cov[:, 3, 3])
@@ -122,11 +123,13 @@ def update_distances(
 
     def correct_by_bottom(at: Floats) -> tuple[Floats, Floats]:
         """Correct by the bottom edge, linearized at distances `at`."""
-        expected = bottom_scale / at
+        tyres = at + camera.overhang_m
+        expected = bottom_scale / tyres
         scale = np.clip(below_horizon, _LOG_LIMIT * expected, expected)
-        jacobian[:, 0] = -1 / at
-        innovation = np.log(scale / expected) + (below_horizon - scale) / scale - (at - mean[:, 0]) / at
+        jacobian[:, 0] = -1 / tyres
+        innovation = np.log(scale / expected) + (below_horizon - scale) / scale - (at - mean[:, 0]) / tyres
         systematic = np.square(horizon_std / scale) + np.square(bottom_std)
+        systematic += np.square(camera.overhang_std_m / tyres)
         variance = np.square(edge_std[:, 1] / scale) * box_frames + systematic * pitch_frames
         return _scalar_update(mean, cov, jacobian, innovation, np.where(bottom_visible, variance, np.inf))
 

@@ -59,7 +59,8 @@ class HorizonFilter:
         self.prior_camera = self.camera = camera
         # Bottom edge below the horizon per width; standard deviation of its mean, and of one vehicle.
         self._slope = camera.height_m / camera.vehicle_width_m
-        self._mean_slope_std = self._slope * camera.height_std_m / camera.height_m
+        self._relative_std = camera.height_std_m / camera.height_m, camera.mean_width_std_m / camera.vehicle_width_m
+        self._mean_slope_std = self._slope * math.hypot(*self._relative_std)
         vehicle_std = self._slope * camera.vehicle_width_std_m / camera.vehicle_width_m
         self._slope_std = math.hypot(self._mean_slope_std, vehicle_std)
         self._ids = np.empty(0, np.int64)
@@ -75,13 +76,16 @@ class HorizonFilter:
         # The width of the near face alone.
         face_scale = camera.focal_px * camera.vehicle_width_m
         width = sides[:, 0] * face_scale / camera.width_times_distance(lateral_offsets(boxes, frame))
+        # The width that the face would have at the distance of the tyres, where the box ends.
+        width /= 1 + camera.overhang_m * width / face_scale
         edge_std = np.hypot(camera.bottom_std_px * scale, camera.box_std * sides)
         variance = (
             np.square(edge_std[:, 1])
             + 2 * np.square(self._slope * edge_std[:, 0])
             + np.square(camera.pitch_std_px * scale)
         )
-        residual = boxes[:, 3] - (camera.horizon_px + self._slope * width)
+        slope = camera.height_m / camera.vehicle_width_m
+        residual = boxes[:, 3] - (camera.horizon_px + slope * width)
         expected = variance + camera.horizon_std_px**2 + np.square(self._slope_std * width)
         fits = np.square(residual) < _OUTLIER**2 * expected
         # If most vehicles do not fit the estimate, the estimate is wrong: forget it faster.
@@ -122,10 +126,17 @@ class HorizonFilter:
         information[[0, 1], [0, 1]] += prior
         vector += prior * (camera.horizon_px, self._slope)
         cov = np.linalg.inv(information)
-        horizon = float((cov @ vector)[0])
+        horizon, slope = map(float, cov @ vector)
+        # The camera's height and the vehicles' width share the change of the slope by their prior variances.
+        by_height, by_width = np.square(self._relative_std)
+        change = math.log(max(slope / self._slope, 0.5)) / max(by_height + by_width, 1e-12)
         std = max(math.sqrt(max(float(cov[0, 0]), 0.0)), _MIN_STD_PX * camera.pixel_scale)
         self.camera = dataclasses.replace(
-            camera, horizon_px=horizon, horizon_std_px=min(std, camera.horizon_std_px)
+            camera,
+            horizon_px=horizon,
+            horizon_std_px=min(std, camera.horizon_std_px),
+            height_m=camera.height_m * math.exp(change * by_height),
+            vehicle_width_m=camera.vehicle_width_m * math.exp(-change * by_width),
         )
 
 
