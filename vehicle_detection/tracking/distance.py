@@ -51,7 +51,10 @@ _MAX_ASPECT = 1.5
 
 def initiate_states(mean: Floats, cov: Floats, camera: Camera) -> KalmanStates:
     """Return the states of new tracks, whose distance is unknown, from those of their boxes."""
-    count, width_std = len(mean), math.hypot(camera.vehicle_width_std_m, camera.mean_width_std_m) / camera.vehicle_width_m
+    count, width_std = (
+        len(mean),
+        math.hypot(camera.vehicle_width_std_m, camera.mean_width_std_m) / camera.vehicle_width_m,
+    )
     length_std = camera.vehicle_length_std_m
     range_std = np.array([_INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD, width_std, length_std])
     range_mean = np.tile([_INITIAL_DISTANCE, 0.0, 0.0, 0.0], (count, 1))

@@ -59,7 +59,10 @@ class HorizonFilter:
         self.prior_camera = self.camera = camera
         # Bottom edge below the horizon per width; standard deviation of its mean, and of one vehicle.
         self._slope = camera.height_m / camera.vehicle_width_m
-        self._relative_std = camera.height_std_m / camera.height_m, camera.mean_width_std_m / camera.vehicle_width_m
+        self._relative_std = (
+            camera.height_std_m / camera.height_m,
+            camera.mean_width_std_m / camera.vehicle_width_m,
+        )
         self._mean_slope_std = self._slope * math.hypot(*self._relative_std)
         vehicle_std = self._slope * camera.vehicle_width_std_m / camera.vehicle_width_m
         self._slope_std = math.hypot(self._mean_slope_std, vehicle_std)
