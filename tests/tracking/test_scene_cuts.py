@@ -32,20 +32,19 @@ def test_the_first_frame_and_equal_ones_are_no_cuts():
 
 @pytest.mark.parametrize("size", [(720, 1280), (360, 480), (640, 360), (90, 160), (6, 9)])
 def test_another_scene_is_a_cut_at_any_size(size):
-    height, width = size
     rows, columns = (np.linspace(0, side - 1, count).astype(int) for side, count in zip(ROAD.shape, size))
     first, second = (np.ascontiguousarray(image[np.ix_(rows, columns)]) for image in (ROAD, OTHER[:, ::-1]))
     assert find_cuts([first, first, second, second, first]) == [2, 4]
 
 
 @pytest.mark.parametrize("fps", [60, 25, 10, 5])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_drive_has_no_cuts_at_any_rate(fps, seed):
-    frames = [scene.image for scene in render_drive(frames=8, fps=fps, shape=(180, 320), random_state=seed)]
+    frames = [scene.image for scene in render_drive(frames=5, fps=fps, shape=(180, 320), random_state=seed)]
     assert find_cuts(frames) == []
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_two_drives_have_a_cut_between_them(seed):
     first, second = (
         [scene.image for scene in render_drive(frames=3, shape=(180, 320), random_state=2 * seed + index)]

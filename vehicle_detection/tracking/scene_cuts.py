@@ -19,9 +19,9 @@ _THUMBNAIL_SIDE, _SAMPLES = 64, 4
 _BLUR = 4.0
 # Blocks in rows and columns, and the part of a block on each side by which its content may move.
 _BLOCKS, _MARGIN = (2, 4), 0.5
-# The limits of a cut: the mean absolute difference of two thumbnails (gray values), and the mean correlation of
-# their blocks, which is `_BASE` plus `_SLOPE` times the difference, but at most `_MAX_CORRELATION`. Measured
-# on real drives at 5 to 25 frames/s, and on pairs of frames of different drives (docs/limits.md).
+# The limits of a cut: the mean absolute difference of two thumbnails (gray values), and the mean correlation
+# of their blocks, which is `_BASE` plus `_SLOPE` times the difference, but at most `_MAX_CORRELATION`.
+# Measured on real drives at 5 to 25 frames/s, and on pairs of frames of different drives (docs/limits.md).
 _MIN_DIFFERENCE, _BASE, _SLOPE, _MAX_CORRELATION = 12.0, 0.5, 0.01, 0.78
 # Standard deviation of a thumbnail's details (gray values) below which nothing can be recognized.
 _MIN_DETAIL = 2.0
@@ -37,7 +37,8 @@ class SceneCuts:
     Examples
     --------
     >>> cuts, random = SceneCuts(), np.random.default_rng(0)
-    >>> first, second = (random.integers(0, 200, (9, 16, 3), np.uint8).repeat(10, 0).repeat(10, 1) for _ in "ab")
+    >>> scenes = random.integers(0, 200, (2, 9, 16, 3), np.uint8)
+    >>> first, second = scenes.repeat(10, axis=1).repeat(10, axis=2)
     >>> [cuts.update(frame) for frame in (first, first + 50, first, second, second)]
     [False, False, False, True, False]
     """
@@ -77,7 +78,7 @@ def _make_thumbnail(frame: NDArray[np.uint8]) -> Thumbnail:
 
 
 def _correlate_blocks(first: Thumbnail, second: Thumbnail) -> float:
-    """Mean over the blocks of `second` of their best normalized correlation with a place near it in `first`."""
+    """Mean over the blocks of `second` of the best correlation with a place near them in `first`."""
     rows, columns = (
         [(index * side // count, (index + 1) * side // count) for index in range(count)]
         for side, count in zip(first.shape, _BLOCKS)
