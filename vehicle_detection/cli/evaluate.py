@@ -45,7 +45,10 @@ def evaluate(
     """Score boxes, and tracks if there are any, against labels."""
     from json import dumps
 
+    import numpy as np
+
     from vehicle_detection._common import write_text
+    from vehicle_detection.evaluation import evaluate_distances
     from vehicle_detection.tables import NO_TRACK
 
     check_targets({"--json": json}, {"PREDICTIONS": predictions, "LABELS": labels})
@@ -68,6 +71,8 @@ def evaluate(
     unknown = [int(((boxes["track_id"] == NO_TRACK) & ~boxes["ignore"]).sum()) for boxes in (found, true)]
     if not any(unknown):
         scores["tracks"] = vd.evaluate_tracks(found, true, **options)
+    if all(np.isfinite(boxes["distance_m"]).any() for boxes in (found, true)):
+        scores["distances"] = evaluate_distances(found, true, iou=iou, frames=chosen)
     print_line("\n\n".join(each.summary() for each in scores.values()))
     _note_frames_of_one_file(found, true, chosen, predictions, labels)
     for boxes, count, file in zip((found, true), unknown, (predictions, labels)):

@@ -8,6 +8,7 @@ from vehicle_detection.evaluation.detections import (
     evaluate_detections,
     precision_recall_curve,
 )
+from vehicle_detection.evaluation.distances import DistanceScores, evaluate_distances
 from vehicle_detection.evaluation.explanation import Explanation, explain
 from vehicle_detection.evaluation.labelled_frames import Frames, LabelledFrames, keyed_frames
 from vehicle_detection.evaluation.matching import (
@@ -21,6 +22,7 @@ from vehicle_detection.evaluation.tracks import TrackScores, evaluate_tracks
 __all__ = [
     "DetectionMatches",
     "DetectionScores",
+    "DistanceScores",
     "Explanation",
     "Frames",
     "LabelledFrames",
@@ -30,6 +32,7 @@ __all__ = [
     "calibrate_scores",
     "calibration_error",
     "evaluate_detections",
+    "evaluate_distances",
     "evaluate_tracks",
     "explain",
     "keyed_frames",
