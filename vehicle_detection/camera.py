@@ -54,7 +54,7 @@ _LENS_STD, _GIVEN_LENS_STD, _UNKNOWN_LENS_STD = 0.08, 0.03, 0.25
 _GIVEN_HEIGHT_STD = 0.05
 # Horizon of an unknown camera, its standard error, that of a given horizon, and the largest one of a horizon
 # that counts as known; fractions of the frame's height. The first is that of a level camera.
-_HORIZON, _HORIZON_STD, _GIVEN_HORIZON_STD, _KNOWN_HORIZON_STD = 0.5, 0.06, 0.012, 0.02
+_HORIZON, _HORIZON_STD, _GIVEN_HORIZON_STD, _KNOWN_HORIZON_STD = 0.5, 0.06, 0.004, 0.02
 # Largest angle from the optical axis (radians) at which boxes are converted to a pinhole camera.
 _MAX_ANGLE = math.radians(80)
 
@@ -126,7 +126,7 @@ class Camera(Checked):
     height_m: float = number(1.3, above=0, high=1e6)
     vehicle_width_m: float = number(1.78, above=0, high=1e6)
     vehicle_width_std_m: float = number(0.2, low=0, high=1e6)
-    mean_width_std_m: float = number(0.1, low=0, high=1e6)
+    mean_width_std_m: float = number(0.14, low=0, high=1e6)
     vehicle_height_m: float = number(1.5, above=0, high=1e6)
     overhang_m: float = number(0.85, low=0, high=1e6)
     overhang_std_m: float = number(0.2, low=0, high=1e6)

@@ -45,6 +45,9 @@ _LOG_LIMIT = 0.5
 _RELINEARIZED = 10.0
 # Innovation in standard errors above which a measurement is an outlier.
 _OUTLIER = 2.5
+# Height of a box relative to that of a car of its width: below the first, it is the side of a vehicle; above the
+# second, the logarithm of the width rises by `_WIDTH_OF_HEIGHT` times the height, to that of a truck.
+_MIN_TALLNESS, _TALL, _WIDTH_OF_HEIGHT, _MAX_TALL_WIDTH = 0.65, 1.15, 0.8, 0.34
 # Aspect ratio above which a detector's boxes are narrower than the vehicle with its side.
 _MAX_ASPECT = 1.5
 
@@ -104,6 +107,10 @@ def update_distances(
     bottom_scale = camera.focal_px * camera.height_m
     oncoming = (mean[:, 1] < -_ONCOMING_SPEED) & (lateral_px > 0)
     width_scale = camera.width_times_distance(lateral_px) - oncoming * _ONCOMING_CUT * lateral_px
+    # Height of a box over the part of its width that shows the near face, relative to that of a car.
+    tallness = sides[:, 1] / sides[:, 0] * width_scale / (camera.focal_px * camera.vehicle_height_m)
+    # The width of a vehicle that crosses the road, or stands across it, is its length.
+    width_visible &= tallness > _MIN_TALLNESS
     unknown = cov[:, 0, 0] > _INITIAL_DISTANCE_STD**2 / 2
     if unknown.any():
         whole = width_visible & ~is_bound
@@ -114,8 +121,10 @@ def update_distances(
         bottom_error = np.hypot(edge_std[:, 1], horizon_std) / np.where(below, below_horizon, 1.0)
         width_error = np.sqrt(cov[:, 2, 2] + np.square(lateral_px / width_scale) * cov[:, 3, 3])
         is_better = below & ((bottom_error < width_error) | ~whole)
-        first = np.where(is_better, by_bottom, width_scale / sides[:, 0])
         known = unknown & (below | whole)
+        # Tall vehicles are wide: vans, buses and trucks.
+        mean[known, 2] = np.clip(_WIDTH_OF_HEIGHT * (tallness[known] - _TALL), 0.0, _MAX_TALL_WIDTH)
+        first = np.where(is_better, by_bottom, width_scale * np.exp(mean[:, 2]) / sides[:, 0])
         mean[known, 0] = np.clip(first[known], _MIN_DISTANCE, _MAX_DISTANCE)
         bottom_visible &= is_better | ~unknown
 
