@@ -27,7 +27,7 @@ class VehicleTruth:
 
     `box` is ``(x1, y1, x2, y2)`` in half-open pixels, without the shadow, and includes parts that other
     vehicles hide; `full_box` also includes the parts outside the image. `distance_m` is along the road to the
-    nearer tires, in row ``horizon_px + focal_px * height_m / distance_m``; it is negative behind the camera.
+    nearest part, and negative behind the camera.
     `ignore` is 1 if the vehicle is not scored: largely occluded, truncated by more than 0.7, narrower than
     40 pixels, or oncoming behind the barrier.
     """
@@ -138,7 +138,7 @@ def ground_truth(
     fraction = 1 - np.count_nonzero(visible) / visible.size
     occluded = 2 if fraction > 0.5 else 1 if fraction >= 0.1 else 0
     truth = VehicleTruth(
-        pose.track, sprite.box, (x1, y1, x2, y2), pose.distance, pose.speed, fraction, occluded, truncated,
+        pose.track, sprite.box, (x1, y1, x2, y2), pose.start, pose.speed, fraction, occluded, truncated,
         ignore=int(pose.oncoming),
     )  # fmt: skip
     return replace(truth, ignore=1) if truth.hard_to_see else truth
