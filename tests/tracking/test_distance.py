@@ -26,10 +26,10 @@ def first_range(box, *, camera=CAMERA, hidden=False):
     return states.range_mean[0, 0], np.sqrt(states.range_cov[0, 0, 0])
 
 
-def box_at(distance, *, width=1.8, camera=CAMERA):
-    """Box of a vehicle straight ahead."""
+def box_at(distance, *, width=CAMERA.vehicle_width_m, camera=CAMERA):
+    """Box of a vehicle straight ahead, which ends at its tyres."""
     pixel = camera.focal_px / distance
-    bottom = camera.horizon_px + pixel * camera.height_m
+    bottom = camera.horizon_px + camera.focal_px * camera.height_m / (distance + camera.overhang_m)
     return [640 - pixel * width / 2, bottom - pixel * 1.5, 640 + pixel * width / 2, bottom]
 
 
@@ -41,22 +41,22 @@ def test_first_distance_of_a_vehicle_is_that_of_the_pinhole_camera(distance):
 
 
 def test_truncated_edges_do_not_contribute_to_the_distance():
-    by_bottom = CAMERA.focal_px * CAMERA.height_m / (520 - CAMERA.horizon_px)
+    by_bottom = CAMERA.focal_px * CAMERA.height_m / (520 - CAMERA.horizon_px) - CAMERA.overhang_m
     by_width = CAMERA.focal_px * CAMERA.vehicle_width_m / 160
     assert first_range([1100.0, 420, 1280, 520])[0] == pytest.approx(by_bottom)
-    assert first_range([560.0, 420, 720, 720])[0] == pytest.approx(by_width)
+    assert first_range([560.0, 580, 720, 720])[0] == pytest.approx(by_width)
     assert first_range([1100.0, 420, 1280, 720])[1] > 500
 
 
 def test_the_first_distance_is_that_of_the_better_measurement():
     # 8 m away by its bottom edge, 10 m by its width.
     near, far = box_at(8.0), box_at(10.0)
-    box = [far[0], near[1], far[2], near[3]]
+    box = [far[0], near[3] - (far[3] - far[1]), far[2], near[3]]
     camera = Camera.for_frame(SHAPE, horizon_std_px=40.0)
     assert first_range(box, camera=camera)[0] == pytest.approx(10.0)
     assert first_range(box)[0] < 9.8  # the horizon is known, and the width corrects the distance
     # Without a visible width, the bottom edge must do.
-    box = [0.0, near[1], near[2] - near[0], near[3]]
+    box = [0.0, box[1], near[2] - near[0], near[3]]
     assert first_range(box, camera=camera)[0] == pytest.approx(8.0)
 
 

@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -133,16 +135,23 @@ def least_squares(camera, boxes, seconds):
     """
     count, slope = len(boxes), camera.height_m / camera.vehicle_width_m
     width, height = (boxes[:, 2:] - boxes[:, :2]).T
+    # The bottom edge is that of the tyres, where the vehicle seems narrower.
+    measured = width
+    width = measured / (1 + camera.overhang_m * measured / (camera.focal_px * camera.vehicle_width_m))
     rows = np.hstack([np.ones((count, 1)), width[:, None], np.diag(width)])
     bottom_std, pitch_std = (
         camera.bottom_std_px * camera.pixel_scale,
         camera.pitch_std_px * camera.pixel_scale,
     )
     variance = bottom_std**2 + (camera.box_std * height) ** 2 + pitch_std**2
-    variance += 2 * slope**2 * (bottom_std**2 + (camera.box_std * width) ** 2)
+    variance += 2 * slope**2 * (bottom_std**2 + (camera.box_std * measured) ** 2)
     # The errors are correlated over half a second.
     weights = seconds / 0.5 / variance
-    prior_std = [camera.horizon_std_px, slope * camera.height_std_m / camera.height_m]
+    prior_std = [
+        camera.horizon_std_px,
+        slope
+        * math.hypot(camera.height_std_m / camera.height_m, camera.mean_width_std_m / camera.vehicle_width_m),
+    ]
     prior_std += [slope * camera.vehicle_width_std_m / camera.vehicle_width_m] * count
     prior = np.diag(np.array(prior_std) ** -2.0)
     cov = np.linalg.inv(prior + (rows.T * weights) @ rows)

@@ -1068,5 +1068,5 @@ def test_the_distance_of_a_near_vehicle_follows_its_bottom_edge(height_std):
     for frame, bottom in enumerate(bottoms):
         box = [450 + 60 * (bottom - 295) / 50, 2 * 201.6 - bottom + 15, 640, bottom]
         (track,) = tracker.update(Detections([box], [4.0]), (360, 640), time=frame * 0.08)
-    true = 576 * camera.height_m / (bottoms[-1] - 201.6)
+    true = 576 * camera.height_m / (bottoms[-1] - 201.6) - camera.overhang_m
     assert abs(track.distance_m - true) < track.distance_std_m < 0.3 * true

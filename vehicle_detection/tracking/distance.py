@@ -45,8 +45,8 @@ _LOG_LIMIT = 0.5
 _RELINEARIZED = 10.0
 # Innovation in standard errors above which a measurement is an outlier.
 _OUTLIER = 2.5
-# Height of a box relative to that of a car of its width: below the first, it is the side of a vehicle; above the
-# second, the logarithm of the width rises by `_WIDTH_OF_HEIGHT` times the height, to that of a truck.
+# Height of a box relative to that of a car of its width: below the first, the box shows a side of a vehicle;
+# above the second, the logarithm of the width rises by `_WIDTH_OF_HEIGHT` times the height, to a truck's.
 _MIN_TALLNESS, _TALL, _WIDTH_OF_HEIGHT, _MAX_TALL_WIDTH = 0.65, 1.15, 0.8, 0.34
 # Aspect ratio above which a detector's boxes are narrower than the vehicle with its side.
 _MAX_ASPECT = 1.5
@@ -123,7 +123,8 @@ def update_distances(
         is_better = below & ((bottom_error < width_error) | ~whole)
         known = unknown & (below | whole)
         # Tall vehicles are wide: vans, buses and trucks.
-        mean[known, 2] = np.clip(_WIDTH_OF_HEIGHT * (tallness[known] - _TALL), 0.0, _MAX_TALL_WIDTH)
+        tall = np.clip(_WIDTH_OF_HEIGHT * (tallness - _TALL), 0.0, _MAX_TALL_WIDTH)
+        mean[:, 2] = np.where(known & whole, tall, mean[:, 2])
         first = np.where(is_better, by_bottom, width_scale * np.exp(mean[:, 2]) / sides[:, 0])
         mean[known, 0] = np.clip(first[known], _MIN_DISTANCE, _MAX_DISTANCE)
         bottom_visible &= is_better | ~unknown
