@@ -127,7 +127,7 @@ def render_scene(
     >>> car = SceneVehicle(distance_m=20.0, kind="sedan", color="white")
     >>> scene = render_scene(shape=(360, 640), vehicles=[car], random_state=1)
     >>> scene.image.shape, scene.truth[0].track, scene.truth[0].distance_m
-    ((360, 640, 3), 1, 20.0)
+    ((360, 640, 3), 1, 19.0)
     """
     rng = make_generator(random_state)
     config = SceneView(**view).configure(rng)

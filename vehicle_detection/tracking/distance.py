@@ -3,7 +3,9 @@
 The state of a distance is ``[distance in m, speed in m/s, log(width / camera.vehicle_width_m), length error
 in m]``. Width and length are part of the state: a truck seems near by its width until its bottom edge has
 corrected it, and from then on its growth in the image gives the speed. The length matters where the side of
-a vehicle is visible, and its error is relative to ``camera.vehicle_length_m``.
+a vehicle is visible, and its error is relative to ``camera.vehicle_length_m``. In names, "range" is the
+distance with this state. The distance is that of the vehicle's nearest part; its box ends at its tyres,
+``camera.overhang_m`` behind that.
 """
 
 from __future__ import annotations
@@ -23,15 +25,16 @@ _MIN_LOG_WIDTH, _MAX_LOG_WIDTH = -0.7, 0.9
 _MIN_LENGTH_ERROR, _MAX_LENGTH_ERROR = -3.0, 8.0
 # Process noise of the speed (m/s per square root of a second).
 _ACCELERATION = 1.5
-# Times (s) in which the width's prior variance is added to its process noise, and over which the pitch of the
-# camera is correlated.
-_WIDTH_TIME, _PITCH_TIME = 20.0, 2.0
-# Mean innovation of an edge above which a track's distance is uncertain, and its relative error per second.
+# Times (s) in which the width's prior variance is added to its process noise, and over which errors that
+# successive frames share (pitch, hills, how much of a side is seen) are correlated.
+_WIDTH_TIME, _SYSTEMATIC_TIME = 20.0, 2.0
+# Mean innovation of an edge (standard errors) above which a distance is uncertain, and the relative error that
+# it then gains (per square root of a second).
 _UNSETTLED, _UNSETTLED_STD = 1.5, 0.5
-# Maximum relative error of a reported distance, age of its last measurement (s), and error of a speed (m/s).
-# Distance, speed and error of a vehicle have a common factor, so that fast vehicles that seem too near, and
-# thus too slow, are below the last limit first: speeds that are stated at -40 m/s lean towards 0 by about a
-# standard error. Over vehicles with speeds of the filter's prior they do not lean towards 0.
+# Maximum relative error of a reported distance, without that of the focal length; maximum age of its last
+# measurement (s), and error of a speed (m/s). A distance that is too small makes the speed and its error too
+# small alike, so such vehicles pass the last limit first: stated speeds near -40 m/s are biased towards 0 by
+# about one standard error.
 _MAX_RANGE_STD, _MAX_RANGE_AGE, _MAX_RANGE_SPEED_STD = 0.4, 0.5, 6.0
 # Fraction of a box that nearer vehicles cover, from which on it is no measurement, and relative error of the
 # width of a box that they cover less.
@@ -90,7 +93,7 @@ def update_distances(
     unsettled |= measured.covered > 0
     cov[:, 0, 0] += unsettled * np.square(_UNSETTLED_STD * mean[:, 0]) * dt
     # A merged box shows neither the bottom nor the width of its vehicles.
-    visible = ~(measured.truncated | measured.merged[:, None])
+    visible = ~(measured.truncated | measured.merged[:, None])  # left, top, right, bottom
     visible &= (measured.covered < _MAX_COVERED)[:, None]
     bottom_visible, width_visible = visible[:, 3], visible[:, 0] & visible[:, 2]
     # Behind a nearer vehicle a box ends where its visible part does, and grows as its vehicle emerges: its
@@ -99,9 +102,11 @@ def update_distances(
     is_bound = measured.hidden[:, [0, 2]].any(axis=1)
     boxes, lateral_px = measured.road_boxes, measured.lateral_px
     sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
+    # (N, 2): the left and right edges, and the top and bottom edges, in pixels.
     edge_std = np.hypot(camera.bottom_std_px * camera.pixel_scale, camera.box_std * sides)
     horizon_std = camera.total_horizon_std_px
-    box_frames, pitch_frames = max(1.0, correlation_time / dt), max(1.0, _PITCH_TIME / dt)
+    # An error that n frames share must not average out among them: its variance is multiplied by n.
+    box_frames, shared_frames = max(1.0, correlation_time / dt), max(1.0, _SYSTEMATIC_TIME / dt)
     below_horizon = boxes[:, 3] - camera.horizon_px
 
     bottom_scale = camera.focal_px * camera.height_m
@@ -129,8 +134,10 @@ def update_distances(
         mean[known, 0] = np.clip(first[known], _MIN_DISTANCE, _MAX_DISTANCE)
         bottom_visible &= is_better | ~unknown
 
-    # Pixels below the horizon: bottom_scale / distance. If they are fewer than expected, their logarithm is
-    # closer to linear in the distance; it is continued by its tangent.
+    # The measurement is z = log(pixels below the horizon), the model h(x) = log(bottom_scale / (x + overhang)).
+    # The logarithm is replaced by its tangent outside 0.5 to 1 times the expected pixels, where a small error
+    # in pixels is a large one of z, or there are none. With h linearized at `at` instead of the mean, the
+    # innovation is z - (h(at) + h'(at) * (mean - at)): one step of an iterated extended Kalman filter.
     bottom_std = np.hypot(camera.height_std_m / camera.height_m, oncoming * _ONCOMING_BOTTOM_STD)
     jacobian = np.zeros_like(mean)
 
@@ -138,12 +145,16 @@ def update_distances(
         """Correct by the bottom edge, linearized at distances `at`."""
         tyres = at + camera.overhang_m
         expected = bottom_scale / tyres
-        scale = np.clip(below_horizon, _LOG_LIMIT * expected, expected)
+        tangent_px = np.clip(below_horizon, _LOG_LIMIT * expected, expected)
         jacobian[:, 0] = -1 / tyres
-        innovation = np.log(scale / expected) + (below_horizon - scale) / scale - (at - mean[:, 0]) / tyres
-        systematic = np.square(horizon_std / scale) + np.square(bottom_std)
+        innovation = (
+            np.log(tangent_px / expected)
+            + (below_horizon - tangent_px) / tangent_px
+            - (at - mean[:, 0]) / tyres
+        )
+        systematic = np.square(horizon_std / tangent_px) + np.square(bottom_std)
         systematic += np.square(camera.overhang_std_m / tyres)
-        variance = np.square(edge_std[:, 1] / scale) * box_frames + systematic * pitch_frames
+        variance = np.square(edge_std[:, 1] / tangent_px) * box_frames + systematic * shared_frames
         return _scalar_update(mean, cov, jacobian, innovation, np.where(bottom_visible, variance, np.inf))
 
     # Far away, noise dominates the correction, so that the predicted distance is more exact.
@@ -157,7 +168,7 @@ def update_distances(
     innovation = np.log(sides[:, 0] / width_scale) - mean[:, 2] - side * mean[:, 3] + np.log(mean[:, 0])
     systematic = _width_variance(measured, camera, width_scale, side)
     # Both edges are measured with the same error.
-    variance = np.square(edge_std[:, 0] / sides[:, 0]) * 2 * box_frames + systematic * pitch_frames
+    variance = np.square(edge_std[:, 0] / sides[:, 0]) * 2 * box_frames + systematic * shared_frames
     jacobian[:, 0], jacobian[:, 2], jacobian[:, 3] = -1 / mean[:, 0], 1.0, side
     variance = np.where(width_visible & ~(is_bound & (innovation < 0)), variance, np.inf)
     mean, cov = _scalar_update(mean, cov, jacobian, innovation, variance)
