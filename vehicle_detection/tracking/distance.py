@@ -21,15 +21,15 @@ from vehicle_detection.tracking.kalman import KalmanStates, Measurements
 
 _INITIAL_DISTANCE, _INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD = 30.0, 1e3, 40.0
 _MIN_DISTANCE, _MAX_DISTANCE = 1.0, 500.0
-_MIN_LOG_WIDTH, _MAX_LOG_WIDTH = -0.7, 0.9
-_MIN_LENGTH_ERROR, _MAX_LENGTH_ERROR = -3.0, 8.0
+# Least and greatest values of a state.
+_LIMITS = np.array([[_MIN_DISTANCE, -np.inf, -0.7, -3.0], [_MAX_DISTANCE, np.inf, 0.9, 8.0]])
 # Process noise of the speed (m/s per square root of a second).
 _ACCELERATION = 1.5
 # Times (s) in which the width's prior variance is added to its process noise, and over which errors that
 # successive frames share (pitch, hills, how much of a side is seen) are correlated.
 _WIDTH_TIME, _SYSTEMATIC_TIME = 20.0, 2.0
-# Mean innovation of an edge (standard errors) above which a distance is uncertain, and the relative error that
-# it then gains (per square root of a second).
+# Mean innovation of an edge (standard errors) above which a distance is uncertain, and the relative error
+# that it then gains (per square root of a second).
 _UNSETTLED, _UNSETTLED_STD = 1.5, 0.5
 # Maximum relative error of a reported distance, without that of the focal length; maximum age of its last
 # measurement (s), and error of a speed (m/s). A distance that is too small makes the speed and its error too
@@ -134,10 +134,9 @@ def update_distances(
         mean[known, 0] = np.clip(first[known], _MIN_DISTANCE, _MAX_DISTANCE)
         bottom_visible &= is_better | ~unknown
 
-    # The measurement is z = log(pixels below the horizon), the model h(x) = log(bottom_scale / (x + overhang)).
-    # The logarithm is replaced by its tangent outside 0.5 to 1 times the expected pixels, where a small error
-    # in pixels is a large one of z, or there are none. With h linearized at `at` instead of the mean, the
-    # innovation is z - (h(at) + h'(at) * (mean - at)): one step of an iterated extended Kalman filter.
+    # The measurement is z = log(below_horizon), the model h(x) = log(bottom_scale / (x + overhang)).
+    # With h linearized at `at` instead of the mean, the innovation is z - (h(at) + h'(at) * (mean - at)): one
+    # step of an iterated extended Kalman filter.
     bottom_std = np.hypot(camera.height_std_m / camera.height_m, oncoming * _ONCOMING_BOTTOM_STD)
     jacobian = np.zeros_like(mean)
 
@@ -145,13 +144,9 @@ def update_distances(
         """Correct by the bottom edge, linearized at distances `at`."""
         tyres = at + camera.overhang_m
         expected = bottom_scale / tyres
-        tangent_px = np.clip(below_horizon, _LOG_LIMIT * expected, expected)
+        log_ratio, tangent_px = _log_by_tangent(below_horizon, expected)
         jacobian[:, 0] = -1 / tyres
-        innovation = (
-            np.log(tangent_px / expected)
-            + (below_horizon - tangent_px) / tangent_px
-            - (at - mean[:, 0]) / tyres
-        )
+        innovation = log_ratio - (at - mean[:, 0]) / tyres
         systematic = np.square(horizon_std / tangent_px) + np.square(bottom_std)
         systematic += np.square(camera.overhang_std_m / tyres)
         variance = np.square(edge_std[:, 1] / tangent_px) * box_frames + systematic * shared_frames
@@ -172,10 +167,17 @@ def update_distances(
     jacobian[:, 0], jacobian[:, 2], jacobian[:, 3] = -1 / mean[:, 0], 1.0, side
     variance = np.where(width_visible & ~(is_bound & (innovation < 0)), variance, np.inf)
     mean, cov = _scalar_update(mean, cov, jacobian, innovation, variance)
-    np.clip(mean[:, 0], _MIN_DISTANCE, _MAX_DISTANCE, out=mean[:, 0])
-    mean[:, 2] = np.clip(mean[:, 2], _MIN_LOG_WIDTH, _MAX_LOG_WIDTH)
-    mean[:, 3] = np.clip(mean[:, 3], _MIN_LENGTH_ERROR, _MAX_LENGTH_ERROR)
-    return states._replace(range_mean=mean, range_cov=cov)
+    return states._replace(range_mean=np.clip(mean, *_LIMITS), range_cov=cov)
+
+
+def _log_by_tangent(pixels: Floats, expected: Floats) -> tuple[Floats, Floats]:
+    """Logarithm of ``pixels / expected``, and the pixels at which it is linearized.
+
+    Outside of `_LOG_LIMIT` to 1 times the expected pixels it is continued by its tangents: near 0 a small
+    error in pixels would be a large one of the logarithm, and below 0 there is none.
+    """
+    tangent_px = np.clip(pixels, _LOG_LIMIT * expected, expected)
+    return np.log(tangent_px / expected) + (pixels - tangent_px) / tangent_px, tangent_px
 
 
 def _width_variance(measured: Measurements, camera: Camera, width_scale: Floats, side: Floats) -> Floats:
