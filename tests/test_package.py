@@ -51,6 +51,7 @@ WITHOUT_EXAMPLE = {
     "draw_tracks": "a picture",
     "Split": "a result of split_random",
     "DetectionScores": "a result of evaluate_detections",
+    "DistanceScores": "a result of evaluate_distances",
     "FrameSet": "a result of load_frames",
     "TrackScores": "a result of evaluate_tracks",
     "TrainingReport": "a result of train_and_evaluate",

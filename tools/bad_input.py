@@ -52,8 +52,8 @@ NOT_CALLED = {
 """Public functions that are not called, and why."""
 
 RESULTS = {
-    "BatchReport", "BatchStatus", "DetectionScores", "Event", "Explanation", "FrameResult", "FrameSet",
-    "FrameSource", "HorizonEstimate", "NetworkModel", "SearchResult", "Track", "TrackScores", "TrackRun",
+    "BatchReport", "BatchStatus", "DetectionScores", "DistanceScores", "Event", "Explanation", "FrameResult",
+    "FrameSet", "FrameSource", "HorizonEstimate", "NetworkModel", "SearchResult", "Track", "TrackScores", "TrackRun",
     "TrainingReport", "Trip", "VehicleCounts", "VideoInfo", "VideoReport", "notebook.ImageDescription",
 }  # fmt: skip
 """Classes whose instances the library makes, and whose constructors therefore check nothing."""
@@ -331,6 +331,7 @@ class _Valid:
             "course.get_hog_features": {"img": image[..., 0]},
             "estimate_horizon": {"boxes": [[40 * n, 60, 30 + 40 * n + n, 90 + n] for n in range(1, 7)]},
             "evaluate_detections": {"labels": truth},
+            "evaluate_distances": {"labels": truth},
             "evaluate_tracks": {"labels": truth},
             "extract_features": {"jobs": 1},
             "find_cars": {"params": search, "jobs": 1},

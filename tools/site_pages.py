@@ -59,7 +59,8 @@ SUBPACKAGE_NAMES = {
         "OwnSpeed Trip VehicleCounts"
     ),
     "evaluation": (
-        "calibrate_scores calibration_error DetectionScores Explanation precision_recall_curve TrackScores"
+        "calibrate_scores calibration_error DetectionScores DistanceScores evaluate_distances Explanation "
+        "precision_recall_curve TrackScores"
     ),
     "search": "SearchResult",
     "tracking": "HorizonEstimate SceneCuts",
