@@ -54,7 +54,8 @@ NOT_CALLED = {
 RESULTS = {
     "BatchReport", "BatchStatus", "DetectionScores", "DistanceScores", "Event", "Explanation", "FrameResult",
     "FrameSet", "FrameSource", "HorizonEstimate", "NetworkModel", "SearchResult", "Track", "TrackScores",
-    "TrackRun", "TrainingReport", "Trip", "VehicleCounts", "VideoInfo", "VideoReport", "notebook.ImageDescription",
+    "TrackRun", "TrainingReport", "Trip", "VehicleCounts", "VideoInfo", "VideoReport",
+    "notebook.ImageDescription",
 }  # fmt: skip
 """Classes whose instances the library makes, and whose constructors therefore check nothing."""
 
