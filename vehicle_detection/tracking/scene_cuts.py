@@ -74,7 +74,7 @@ def _make_thumbnail(frame: NDArray[np.uint8]) -> Thumbnail:
     height, width = (max(8, round(side * scale)) for side in frame.shape[:2])
     sampled = cv2.resize(frame, (width * _SAMPLES, height * _SAMPLES), interpolation=cv2.INTER_NEAREST)
     shrunk = cv2.resize(sampled, (width, height), interpolation=cv2.INTER_AREA)
-    return shrunk.mean(axis=2, dtype=np.float32)
+    return np.asarray(shrunk.mean(axis=2, dtype=np.float32))
 
 
 def _correlate_blocks(first: Thumbnail, second: Thumbnail) -> float:
