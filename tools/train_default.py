@@ -174,7 +174,8 @@ def _load_weights(path: Path) -> Network:
 
     network = Network()
     load_model(network, path)
-    return network.eval()
+    network.eval()
+    return network
 
 
 def _network(

@@ -25,3 +25,5 @@ from .search import plot_windows as plot_windows
 from .tracks import plot_birds_eye as plot_birds_eye
 from .tracks import plot_stage_times as plot_stage_times
 from .tracks import plot_tracks as plot_tracks
+
+__all__: list[str]
