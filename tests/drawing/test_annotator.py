@@ -248,7 +248,9 @@ class TestPosition:
     def test_where_the_frame_truncates_the_near_end(self, left, sign):
         """The visible far end of the side gives the position: here 4.5 m behind the near end, at 150 px."""
         known = track((left, 380, left + 490, 600), distance_m=4.0, distance_std_m=0.5)
-        assert road_position(known, CAMERA, SHAPE).lateral_m == pytest.approx(sign * (0.150 * 8.5 + 0.9))
+        assert road_position(known, CAMERA, SHAPE).lateral_m == pytest.approx(
+            sign * (0.150 * 8.5 + CAMERA.vehicle_width_m / 2)
+        )
 
     def test_a_whole_box_of_a_fisheye_lens_is_not_truncated(self):
         camera = Camera.for_frame(SHAPE, lens="fisheye-120")

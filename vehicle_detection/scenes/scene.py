@@ -27,7 +27,7 @@ RandomState = int | np.random.Generator | None
 class SceneVehicle(Checked):
     """A vehicle to place in a scene; `kind` and `color` are random if they are None."""
 
-    distance_m: float = number(low=2, high=1000)  # along the road from the camera to the nearer tires
+    distance_m: float = number(low=2, high=1000)  # along the road to the nearer tires
     lateral_m: float = number(0.0, low=-100, high=100)  # of its middle, to the right; a lane is 3.6 m wide
     kind: str | None = choice(None, VEHICLE_SHAPES)  # hatchback, estate, sedan, mpv, suv, van or truck
     color: str | None = choice(None, COLORS)
@@ -126,7 +126,7 @@ def render_scene(
     --------
     >>> car = SceneVehicle(distance_m=20.0, kind="sedan", color="white")
     >>> scene = render_scene(shape=(360, 640), vehicles=[car], random_state=1)
-    >>> scene.image.shape, scene.truth[0].track, scene.truth[0].distance_m
+    >>> scene.image.shape, scene.truth[0].track, round(scene.truth[0].distance_m, 1)
     ((360, 640, 3), 1, 19.0)
     """
     rng = make_generator(random_state)

@@ -446,7 +446,7 @@ def track(
     >>> for result in track("test_images/*.jpg", "highway", end=0.08, frames=True):
     ...     print(result.index, result.time, result.frame.shape, len(result.detections))
     0 0.0 (720, 1280, 3) 2
-    1 0.04 (720, 1280, 3) 0
+    1 0.04 (720, 1280, 3) 4
     """
     check_flags(frames=frames, progress=progress)
     start, end = check_span(start, end)
