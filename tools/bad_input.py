@@ -14,7 +14,7 @@ import argparse
 import contextlib
 import inspect
 import itertools
-import operator
+import pkgutil
 import signal
 import sys
 import tempfile
@@ -123,7 +123,7 @@ def package_names() -> dict[str, Any]:
         name: f"{module}.{name}" for module, names in SUBPACKAGE_NAMES.items() for name in names.split()
     }
     places |= {name: name for name in vd.__all__}
-    return {name: operator.attrgetter(place)(vd) for name, place in places.items()}
+    return {name: pkgutil.resolve_name(f"vehicle_detection.{place}") for name, place in places.items()}
 
 
 def _methods(kind: type) -> Iterator[tuple[str, Callable[..., Any]]]:

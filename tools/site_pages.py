@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import ast
 import inspect
-import operator
 import os
+import pkgutil
 import re
 import subprocess
 import sys
 from pathlib import Path, PurePosixPath
-
-import vehicle_detection
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -149,7 +147,7 @@ def api_pages() -> dict[str, str]:
     pages = {}
     for page, title, modules in API_PAGES:
         found = sorted((name for module in modules.split() for name in names.pop(module)), key=str.lower)
-        table = [".. autosummary::", "", *(f"   {_place(name)}" for name in found), ""]
+        table = [".. autosummary::", "", *(f"   {name}" for name in found), ""]
         pages[f"{page}.rst"] = "\n".join(
             [*_heading(title), ".. currentmodule:: vehicle_detection", "", *table, *map(_directive, found)]
         )
@@ -191,7 +189,7 @@ def _place(name: str) -> str:
 
 
 def _directive(name: str) -> str:
-    value = operator.attrgetter(name)(vehicle_detection)
+    value = pkgutil.resolve_name(f"vehicle_detection.{name}")
     if not inspect.isclass(value):
         return f".. autofunction:: {_place(name)}\n"
     kind = "autoexception" if issubclass(value, BaseException) else "autoclass"
