@@ -92,7 +92,7 @@ class Camera(Checked):
     vehicle_height_m
         Mean height of vehicles.
     overhang_m, overhang_std_m
-        Mean distance between a vehicle's nearest part and its tyres, where its box ends, and its standard
+        Mean distance between a vehicle's nearest part and its tires, where its box ends, and its standard
         deviation.
     vehicle_length_m, vehicle_length_std_m
         Mean length of the visible side of vehicles in other lanes, and its standard deviation.

@@ -60,7 +60,7 @@ def test_truth_is_consistent(vehicles, horizon, seed):
     assert scene.boxes.shape == (len(scene.truth), 4)
     for row in scene.truth:
         vehicle = vehicles[row.track - 1]
-        # The nearest part is before the tyres.
+        # The nearest part is before the tires.
         assert 0.5 < vehicle.distance_m - row.distance_m < 2
         assert row.speed_mps == vehicle.speed_mps
 

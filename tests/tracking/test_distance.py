@@ -27,7 +27,7 @@ def first_range(box, *, camera=CAMERA, hidden=False):
 
 
 def box_at(distance, *, width=CAMERA.vehicle_width_m, camera=CAMERA):
-    """Box of a vehicle straight ahead, which ends at its tyres."""
+    """Box of a vehicle straight ahead, which ends at its tires."""
     pixel = camera.focal_px / distance
     bottom = camera.horizon_px + camera.focal_px * camera.height_m / (distance + camera.overhang_m)
     return [640 - pixel * width / 2, bottom - pixel * 1.5, 640 + pixel * width / 2, bottom]

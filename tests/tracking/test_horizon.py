@@ -135,7 +135,7 @@ def least_squares(camera, boxes, seconds):
     """
     count, slope = len(boxes), camera.height_m / camera.vehicle_width_m
     width, height = (boxes[:, 2:] - boxes[:, :2]).T
-    # The bottom edge is that of the tyres, where the vehicle seems narrower.
+    # The bottom edge is that of the tires, where the vehicle seems narrower.
     measured = width
     width = measured / (1 + camera.overhang_m * measured / (camera.focal_px * camera.vehicle_width_m))
     rows = np.hstack([np.ones((count, 1)), width[:, None], np.diag(width)])

@@ -43,8 +43,9 @@ class ErrorScores(Scores):
     def summary(self) -> str:
         """Return the scores as one line."""
         within = " / ".join(map(format_number, (self.within_1_std, self.within_2_std)))
+        bias = "n/a" if np.isnan(self.bias) else f"{self.bias:+.3f}"
         return (
-            f"error {format_number(self.error)}, bias {self.bias:+.3f}, within 1 / 2 std {within}, "
+            f"error {format_number(self.error)}, bias {bias}, within 1 / 2 std {within}, "
             f"stated {self.stated} of {self.known}"
         )
 

@@ -4,7 +4,7 @@ The state of a distance is ``[distance in m, speed in m/s, log(width / camera.ve
 in m]``. Width and length are part of the state: a truck seems near by its width until its bottom edge has
 corrected it, and from then on its growth in the image gives the speed. The length matters where the side of
 a vehicle is visible, and its error is relative to ``camera.vehicle_length_m``. In names, "range" is the
-distance with this state. The distance is that of the vehicle's nearest part; its box ends at its tyres,
+distance with this state. The distance is that of the vehicle's nearest part; its box ends at its tires,
 ``camera.overhang_m`` behind that.
 """
 
@@ -142,13 +142,13 @@ def update_distances(
 
     def correct_by_bottom(at: Floats) -> tuple[Floats, Floats]:
         """Correct by the bottom edge, linearized at distances `at`."""
-        tyres = at + camera.overhang_m
-        expected = bottom_scale / tyres
+        tires = at + camera.overhang_m
+        expected = bottom_scale / tires
         log_ratio, tangent_px = _log_by_tangent(below_horizon, expected)
-        jacobian[:, 0] = -1 / tyres
-        innovation = log_ratio - (at - mean[:, 0]) / tyres
+        jacobian[:, 0] = -1 / tires
+        innovation = log_ratio - (at - mean[:, 0]) / tires
         systematic = np.square(horizon_std / tangent_px) + np.square(bottom_std)
-        systematic += np.square(camera.overhang_std_m / tyres)
+        systematic += np.square(camera.overhang_std_m / tires)
         variance = np.square(edge_std[:, 1] / tangent_px) * box_frames + systematic * shared_frames
         return _scalar_update(mean, cov, jacobian, innovation, np.where(bottom_visible, variance, np.inf))
 

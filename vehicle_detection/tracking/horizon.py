@@ -51,8 +51,9 @@ class HorizonFilter:
     slopes as random effects (Laird and Ware, *Biometrics*, 1982): a vehicle at constant distance contributes
     little, several vehicles more, and an approaching one most.
 
-    `prior_camera` is the camera as given, whose horizon is fixed if its standard error is 0, and `camera` the
-    current estimate.
+    `prior_camera` is the camera as given, and `camera` the current estimate: of the horizon, and of the mean
+    width of vehicles and the camera's height, on which the slope depends. Nothing is estimated if the
+    standard error of the horizon is 0.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -79,7 +80,7 @@ class HorizonFilter:
         # The width of the near face alone.
         face_scale = camera.focal_px * camera.vehicle_width_m
         width = sides[:, 0] * face_scale / camera.width_times_distance(lateral_offsets(boxes, frame))
-        # The width that the face would have at the distance of the tyres, where the box ends.
+        # The width that the face would have at the distance of the tires, where the box ends.
         width /= 1 + camera.overhang_m * width / face_scale
         edge_std = np.hypot(camera.bottom_std_px * scale, camera.box_std * sides)
         variance = (
@@ -131,6 +132,7 @@ class HorizonFilter:
         cov = np.linalg.inv(information)
         horizon, slope = map(float, cov @ vector)
         # The camera's height and the vehicles' width share the change of the slope by their prior variances.
+        # A slope of less than half the prior one is not that of vehicles; below 0 it has no logarithm.
         by_height, by_width = np.square(self._relative_std)
         change = math.log(max(slope / self._slope, 0.5)) / max(by_height + by_width, 1e-12)
         std = max(math.sqrt(max(float(cov[0, 0]), 0.0)), _MIN_STD_PX * camera.pixel_scale)

@@ -21,7 +21,7 @@ _BLUR = 4.0
 _BLOCKS, _MARGIN = (2, 4), 0.5
 # The limits of a cut: the mean absolute difference of two thumbnails (gray values), and the mean correlation
 # of their blocks, which is `_BASE` plus `_SLOPE` times the difference, but at most `_MAX_CORRELATION`.
-# Measured on real drives at 5 to 25 frames/s, and on pairs of frames of different drives (docs/limits.md).
+# Measured by ``python -m benchmarks cuts`` on real drives and on pairs of frames of different roads.
 _MIN_DIFFERENCE, _BASE, _SLOPE, _MAX_CORRELATION = 12.0, 0.5, 0.01, 0.78
 # Standard deviation of a thumbnail's details (gray values) below which nothing can be recognized.
 _MIN_DETAIL = 2.0
@@ -44,20 +44,19 @@ class SceneCuts:
     """
 
     def __init__(self) -> None:
-        self._last: Thumbnail | None = None
-        self._last_details: Thumbnail | None = None
+        self._last: tuple[Thumbnail, Thumbnail] | None = None  # the last frame's, and its details
 
     def update(self, frame: NDArray[np.uint8]) -> bool:
         """Whether the next ``(H, W, 3)`` frame, of any size, belongs to another scene than the one before."""
         check_image(frame, "frame")
         thumbnail = _make_thumbnail(frame)
         details = thumbnail - cv2.GaussianBlur(thumbnail, (0, 0), _BLUR)
-        last, last_details = self._last, self._last_details
-        if last is not None and details.std() < _MIN_DETAIL:
+        if self._last is not None and details.std() < _MIN_DETAIL:
             return False
-        self._last, self._last_details = thumbnail, details
-        if last is None or last_details is None:
+        before, self._last = self._last, (thumbnail, details)
+        if before is None:
             return False
+        last, last_details = before
         if last.shape != thumbnail.shape:
             return True
         # Most frames need the first comparison only.
