@@ -49,7 +49,7 @@ def test_a_grid_becomes_a_table_and_a_figure(patches, tmp_path, monkeypatch):
     assert np.ptp(read_image(plot)) == 255
     # The same command finds no configuration left to measure.
     text = out.read_text()
-    monkeypatch.setattr("vehicle_detection.training.trials.TrialEvaluator.evaluate", None)
+    monkeypatch.setattr("vehicle_detection.training.trials.Trials.measure", None)
     assert run(*words).exit_code == 0
     assert out.read_text() == text
 
@@ -80,16 +80,16 @@ def test_frames_are_scored(patches, material, tmp_path):
 
 
 def test_an_interrupt_keeps_the_measured_rows(patches, tmp_path, monkeypatch):
-    evaluate = trials.TrialEvaluator.evaluate
+    measure = trials.Trials.measure
     done = []
 
     def interrupted(self, *arguments, **options):
         if done:
             raise KeyboardInterrupt
         done.append(1)
-        return evaluate(self, *arguments, **options)
+        return measure(self, *arguments, **options)
 
-    monkeypatch.setattr(trials.TrialEvaluator, "evaluate", interrupted)
+    monkeypatch.setattr(trials.Trials, "measure", interrupted)
     result = run(*patches, "--grid", f"orient=3,4 {SMALL}", "-o", tmp_path / "table.csv")
     assert result.exit_code == 130
     assert list(read_results(tmp_path / "table.csv")["orient"]) == [3]

@@ -10,14 +10,14 @@ from vehicle_detection.features import FeatureParams
 from vehicle_detection.tables import TrackTable
 from vehicle_detection.training import (
     FeatureCache,
+    RowStore,
     TrainingOptions,
-    TrialConfig,
     TrialOptions,
     compare_configurations,
     train_classifier,
     trials,
 )
-from vehicle_detection.training.trials import TrialEvaluator
+from vehicle_detection.training.trials import COLUMNS, Trials, read_configurations
 
 PARAMS = FeatureParams(**SMALL)
 
@@ -37,11 +37,9 @@ def test_a_trial_equals_training_on_that_part(patch_set, mirror, split):
         params=PARAMS,
         options=TrainingOptions(C=0.01, mirror=mirror, random_state=3),
     )
-    config = TrialConfig(PARAMS, TrainingOptions(C=0.01, mirror=mirror))
-    tried = TrialEvaluator(patch_set, UNTIMED).train(config, parts.train, 3)
-    for name in ("mean", "scale", "coef", "intercept"):
-        expected, found = (getattr(each.templates[0], name) for each in (classifier, tried))
-        np.testing.assert_array_equal(found, expected)
+    (candidate,) = read_configurations([{**SMALL, "C": 0.01, "mirror": mirror}])
+    tried = Trials(patch_set, UNTIMED, RowStore(None, COLUMNS)).train(candidate, parts.train, 3)
+    np.testing.assert_array_equal(tried.templates[0].coef, classifier.templates[0].coef)
     assert row["accuracy"] == classifier.score(test.patches, test.labels)
     assert row["train_accuracy"] == classifier.score(train.patches, train.labels)
     assert (row["train_size"], row["test_size"]) == (len(train), len(test))
@@ -51,13 +49,11 @@ def test_a_trial_equals_training_on_that_part(patch_set, mirror, split):
 def test_a_weight_on_vehicles_finds_more_of_them(patch_set):
     noise = np.random.default_rng(0).integers(0, 2, len(patch_set)).astype(bool)
     noisy = PatchSet(patch_set.patches, patch_set.labels ^ noise, patch_set.names)
-    evaluator = TrialEvaluator(noisy, UNTIMED)
-    found = []
-    for weight in (0.05, 1.0, 20.0):
-        config = TrialConfig(PARAMS, TrainingOptions(mirror=False, positive_weight=weight))
-        classifier = evaluator.train(config, np.arange(len(noisy)), 0)
-        found.append(classifier.predict(noisy.patches).sum())
-    assert found[0] < found[1] < found[2]
+    trials = Trials(noisy, UNTIMED, RowStore(None, COLUMNS))
+    configurations = [{**SMALL, "mirror": False, "positive_weight": weight} for weight in (0.05, 1.0, 20.0)]
+    trained = [trials.train(each, np.arange(120), 0) for each in read_configurations(configurations)]
+    few, some, many = (classifier.predict(noisy.patches).sum() for classifier in trained)
+    assert few < some < many
 
 
 def test_features_that_exceed_the_memory_fail(patch_set, monkeypatch):

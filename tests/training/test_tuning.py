@@ -20,7 +20,7 @@ from vehicle_detection.training import (
     read_results,
     search_parameters,
 )
-from vehicle_detection.training.trials import COLUMNS, TrialEvaluator
+from vehicle_detection.training.trials import COLUMNS, Trials
 from vehicle_detection.training.tuning import make_folds
 
 
@@ -79,7 +79,7 @@ def test_impossible_combinations_are_reported_and_skipped(patch_set, caplog):
     assert "got pix_per_cell=10" in table["message"][3]
     assert table["accuracy"][3] > 0.7
     assert table["search_ms"].notna().tolist() == [True, True, False, False, False]
-    assert "none failed: orient must be" in caplog.text
+    assert "none, C=0.0001: failed: orient must be" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_a_second_run_measures_only_what_is_new(patch_set, tmp_path, monkeypatch
     pd.testing.assert_frame_equal(read_results(store), first)
     # The name of a configuration is not part of the trial.
     more = compare(patch_set, {"b": SMALL, "c": {**SMALL, "hist_bins": 4}}, **options)
-    assert [config.params.hist_bins for config in tried] == [4, 4]
+    assert [candidate.params.hist_bins for candidate in tried] == [4, 4]
     assert more["configuration"].tolist() == ["b", "b", "c", "c"]
     assert len(read_results(store)) == 5
 
@@ -293,14 +293,14 @@ def test_an_interrupted_search_continues_from_its_store(patch_set, tmp_path, mon
 
 
 def test_a_configuration_that_cannot_be_trained_is_dropped(patch_set, monkeypatch):
-    train = TrialEvaluator.train
+    train = Trials.train
 
-    def train_others(self, config, *arguments):
-        if config.params.orient == 6:
+    def train_others(self, candidate, *arguments):
+        if candidate.params.orient == 6:
             raise InvalidInputError("too large")
-        return train(self, config, *arguments)
+        return train(self, candidate, *arguments)
 
-    monkeypatch.setattr(TrialEvaluator, "train", train_others)
+    monkeypatch.setattr(Trials, "train", train_others)
     grid = {**SMALL_GRID, "orient": [6, 4]}
     table = search_parameters(patch_set, grid, split="random", halving=Halving(n_folds=2), options=UNTIMED)
     halving = table[table["stage"] == "halving"]

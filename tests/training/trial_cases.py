@@ -2,7 +2,7 @@
 
 from vehicle_detection.search import SearchBand, SearchParams
 from vehicle_detection.training import TrialOptions
-from vehicle_detection.training.trials import TrialEvaluator
+from vehicle_detection.training.trials import Trials
 
 SMALL = {"spatial_size": 8, "hist_bins": 8, "orient": 4, "pix_per_cell": 16, "hog_channel": 0}
 SMALL_GRID = {name: [value] for name, value in SMALL.items()}
@@ -15,15 +15,15 @@ SEARCH = SearchParams(
 def count_trials(monkeypatch, stop_after=None):
     """List the configurations that are evaluated, and interrupt the run after some."""
     configs = []
-    evaluate = TrialEvaluator.evaluate
+    measure = Trials.measure
 
-    def counted(self, config, *arguments, **options):
+    def counted(self, candidate, *arguments, **options):
         if stop_after is not None and len(configs) == stop_after:
             raise KeyboardInterrupt
-        configs.append(config)
-        return evaluate(self, config, *arguments, **options)
+        configs.append(candidate)
+        return measure(self, candidate, *arguments, **options)
 
-    monkeypatch.setattr(TrialEvaluator, "evaluate", counted)
+    monkeypatch.setattr(Trials, "measure", counted)
     return configs
 
 

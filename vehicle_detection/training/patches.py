@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import textwrap
 import threading
 import time
@@ -10,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from importlib.resources import files
 from typing import Any, Literal
 
 import numpy as np
@@ -310,58 +312,44 @@ def model_card(
 
     `others` are reports of other features on the same patches, `command` trains the model.
     """
-    known = {"", *report.splits, *report.sources}
-    limitations = [f"- {text}" for condition, text in _LIMITATIONS if condition in known]
-    parts = [
-        f"# Model card: {name}" if name else "# Model card",
-        *_card_model(classifier, report, command),
-        *_card_data(report),
-        *_card_accuracy(report, others),
-        "## Limitations",
-        "\n".join(limitations),
+    from jinja2 import Environment, StrictUndefined
+
+    names = [split for split in SPLITS if split in report.splits]
+    accuracies = [
+        (each.features, str(each.params.length), *(f"{each.splits[split].accuracy:.4f}" for split in names))
+        for each in (report, *others)
     ]
-    return "\n\n".join(map(_wrap, parts)) + "\n"
-
-
-# Splits and sources of patches (or none), and what their use means.
-_LIMITATIONS = (
-    ("", "The accuracy is measured on patches, not in frames, where most windows show no vehicle."),
-    (
-        "random",
-        "Neighboring patches show the same vehicle in consecutive frames. A random split therefore tests on "
-        "near duplicates of training patches, and its accuracy is too optimistic.",
-    ),
-    (
-        "KITTI_extracted",
-        "The file numbers of `KITTI_extracted` are shuffled, so that the split by sequences leaks there like "
-        "the random one. Only the cross-source rows test on another camera and other roads.",
-    ),
-    (
-        "Extras",
-        "`Extras` holds crops of the road in the course's project video. Scores on clips of that road are "
-        "too optimistic.",
-    ),
-    (
-        "KITTI_extracted",
-        "Most patches show cars from behind by day. Trucks, buses, motorcycles, vehicles seen directly from "
-        "the side, night and heavy rain are rare or missing.",
-    ),
-)
+    environment = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["plural"] = pluralize
+    template = files("vehicle_detection.training").joinpath("model_card.md.j2").read_text(encoding="utf-8")
+    text = environment.from_string(template).render(
+        name=name,
+        report=report,
+        params=report.params,
+        options=report.options,
+        versions=[" ".join(each) for each in classifier.metadata["versions"].items()],
+        command=command,
+        sources=markdown_table(("source", "patches"), [(key, f"{n:,}") for key, n in report.sources.items()]),
+        of_the_course=any(source.startswith(("GTI", "KITTI")) for source in report.sources),
+        accuracy=markdown_table(*report_table(report)),
+        others=others
+        and markdown_table(("features", "length", *(SPLITS[split] for split in names)), accuracies),
+    )
+    return "\n\n".join(map(_wrap, re.split(r"\n{2,}", text.strip()))) + "\n"
 
 
 def _wrap(part: str) -> str:
     """Wrap a paragraph or the items of a list; titles, tables and code are left as they are."""
     if part.startswith(("#", "|", "```")):
         return part
-    return "\n".join(
-        markdown_text(line[2:], "- ") if line[:2] == "- " else markdown_text(line)
-        for line in part.split("\n")
-    )
+    items = re.split(r"^- ", part, flags=re.MULTILINE)
+    return "\n".join(markdown_text(item, "- ") for item in items[1:]) if items[1:] else markdown_text(part)
 
 
 def markdown_text(text: str, mark: str = "") -> str:
     """Wrap a paragraph, or a list item that starts with `mark`, to 110 columns."""
     indent = " " * len(mark)
+    text = " ".join(text.split())
     return textwrap.fill(text, 110, initial_indent=mark, subsequent_indent=indent, break_on_hyphens=False)
 
 
@@ -369,43 +357,6 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str
     """Format a Markdown table."""
     lines = [columns, ["---"] * len(columns), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def _card_model(classifier: VehicleClassifier, report: TrainingReport, command: str | None) -> Iterator[str]:
-    params, options = report.params, report.options
-    lengths = f"{params.spatial_length} spatial bins, {params.hist_length} histogram, {params.hog_length} HOG"
-    versions = ", ".join(f"{name} {text}" for name, text in classifier.metadata["versions"].items())
-    copies = "with mirrored patches" if options.mirror else "without mirrored patches"
-    copies += f" of varied brightness (gamma {options.gamma:g})" if options.gamma else ""
-    copies += f" and degraded copies (weight {options.degraded:g})" if options.degraded else ""
-    yield "A linear SVM that classifies 64x64 RGB patches as vehicle or non-vehicle, for searching images."
-    yield (
-        f"- Features: {report.features}, in {params.color_space}, {params.length} values ({lengths})\n"
-        f"- Training: C = {options.C:g}, {copies}, seed {options.random_state}\n"
-        f"- Versions: {versions}"
-    )
-    if command:
-        yield from ("Trained by", f"```bash\n{command}\n```")
-        yield "The same command with the same versions writes the same file."
-
-
-def _card_data(report: TrainingReport) -> Iterator[str]:
-    yield "## Data"
-    yield (
-        f"{report.vehicles:,} patches of vehicles and {report.non_vehicles:,} of non-vehicles "
-        f"({report.balance:.1%} vehicles). The model is trained on all "
-        f"{report.vehicles + report.non_vehicles:,}."
-    )
-    yield markdown_table(("source", "patches"), [(name, f"{n:,}") for name, n in report.sources.items()])
-    yield f"Fingerprint of the patches (SHA-256): `{report.fingerprint}`"
-    if any(source.startswith(("GTI", "KITTI")) for source in report.sources):
-        yield (
-            "License: the patches come from the GTI vehicle image database and the KITTI benchmark, both "
-            "CC BY-NC-SA 3.0. The model is derived from them and has the same terms: non-commercial use, "
-            "with attribution."
-        )
-    else:
-        yield "License: the model inherits the terms of the patches that it is trained on."
 
 
 _SPLIT_COLUMNS = {
@@ -443,28 +394,3 @@ def report_table(report: TrainingReport) -> tuple[list[str], list[list[str]]]:
     """Column titles and rows of text for the splits of a report."""
     scores = report.splits.items()
     return split_table({name: {"train": score.train, **_split_metadata(score)} for name, score in scores})
-
-
-def _card_accuracy(report: TrainingReport, others: Sequence[TrainingReport]) -> Iterator[str]:
-    method = (
-        "Scaler and SVM are fitted on the training part of each split and evaluated on the test part. A "
-        "near duplicate is a test patch whose 16x16 gray thumbnail has a correlation of at least 0.95 with "
-        "that of a training patch."
-    )
-    if "random" in report.splits:
-        seeds = pluralize(len(report.splits["random"].accuracies), "seed")
-        method += f" The random split is the mean of {seeds}."
-    yield from ("## Accuracy", method, markdown_table(*report_table(report)))
-    if report.calibration_error is not None:
-        yield (
-            f"The expected calibration error of the probabilities is {report.calibration_error:.4f} on "
-            "the last fifth of each folder. Platt's sigmoid is fitted on the last fifth of the rest."
-        )
-    if others:
-        names = [name for name in SPLITS if name in report.splits]
-        accuracies = [
-            (each.features, str(each.params.length), *(f"{each.splits[name].accuracy:.4f}" for name in names))
-            for each in (report, *others)
-        ]
-        yield "Other features, trained and evaluated in the same way:"
-        yield markdown_table(("features", "length", *(SPLITS[name] for name in names)), accuracies)

@@ -26,8 +26,8 @@ from vehicle_detection.regions import RegionParams
 from vehicle_detection.search import SearchParams
 from vehicle_detection.svm import VehicleClassifier
 from vehicle_detection.tables import TrackTable
-from vehicle_detection.training.classifier import TrainingOptions, check_labels, fit_features
-from vehicle_detection.training.feature_cache import FeatureCache, digest_of
+from vehicle_detection.training.classifier import DEFAULT_C, TrainingOptions, check_labels, fit_features
+from vehicle_detection.training.feature_cache import FeatureCache, digest_of, open_cache
 from vehicle_detection.training.results import RowStore, make_table, number_or_text
 
 if TYPE_CHECKING:
@@ -56,37 +56,25 @@ _BOOLEANS = {"true": True, "yes": True, "false": False, "no": False}
 _LOGGER = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class TrialConfig:
-    """Features and training options of one classifier."""
-
-    params: FeatureParams
-    training: TrainingOptions
-
-    def to_columns(self) -> dict[str, Any]:
-        """Return the columns of a result row that describe the configuration."""
-        training = {name: getattr(self.training, name) for name in TRAINING_FIELDS}
-        return {**dataclasses.asdict(self.params), "n_features": self.params.length, **training}
-
-
 Configuration = FeatureParams | Mapping[str, Any] | str
 """`FeatureParams`, a preset's name, or a mapping of fields of `FeatureParams` and of training options."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A named configuration; `config` is None where it is impossible, and `error` then says why."""
+    """Features and training options of one classifier; an impossible combination has only an error."""
 
-    name: str
-    options: Mapping[str, Any]
-    config: TrialConfig | None
+    name: str = dataclasses.field(compare=False)
+    columns: dict[str, Any] = dataclasses.field(compare=False)  # of a row
+    params: FeatureParams | None = None
+    training: TrainingOptions | None = None
     error: str | None = None
 
 
 def read_configurations(
-    configurations: Mapping[str, Configuration] | Sequence[Configuration], *, C: float
+    configurations: Mapping[str, Configuration] | Sequence[Configuration], C: Sequence[float] = (DEFAULT_C,)
 ) -> list[Candidate]:
-    """Check each configuration; `C` is that of configurations that do not set it."""
+    """Check each configuration; one that does not set `C` is a candidate with each of these values."""
     given: object = configurations
     if isinstance(given, Mapping):
         pairs: list[tuple[str | None, Any]] = list(given.items())
@@ -97,10 +85,16 @@ def read_configurations(
             "configurations must be a mapping from names to FeatureParams or a list of them, with at least "
             f"one entry; got {describe(given)}"
         )
-    return [_read(name, each, C) for name, each in pairs]
+    read = [(name, _read_options(configuration)) for name, configuration in pairs]
+    return [
+        _make_candidate(name, {**options, "C": value})
+        for name, options in read
+        for value in ([options["C"]] if "C" in options else C)
+    ]
 
 
-def _read(name: str | None, configuration: object, C: float) -> Candidate:
+def _read_options(configuration: object) -> dict[str, Any]:
+    """Options of a configuration in any of its forms."""
     if isinstance(configuration, str):
         configuration = FeatureParams.preset(configuration)
     if isinstance(configuration, FeatureParams):
@@ -110,16 +104,20 @@ def _read(name: str | None, configuration: object, C: float) -> Candidate:
             "a configuration must be FeatureParams, a mapping of options or a preset's name; "
             f"got {describe(configuration)}"
         )
-    options = dict(configuration)
-    _check_names(options, "configuration")
-    features = {key: value for key, value in options.items() if key in FEATURE_FIELDS}
-    defaults = {"C": C, "mirror": True, "positive_weight": 1.0}
-    training = {key: options.get(key, default) for key, default in defaults.items()}
+    _check_names(configuration, "configuration")
+    return dict(configuration)
+
+
+def _make_candidate(name: str | None, options: Mapping[str, Any]) -> Candidate:
+    values = {"mirror": True, "positive_weight": 1.0, **options}
+    training = {key: values.pop(key) for key in TRAINING_FIELDS}
     try:
-        config = TrialConfig(FeatureParams(**features), TrainingOptions(**training))
+        params, fitting = FeatureParams(**values), TrainingOptions(**training)
     except InvalidInputError as error:
-        return Candidate(name or _join_options(options), {**options, **training}, None, str(error))
-    return Candidate(name or describe_params(config.params), options, config)
+        return Candidate(name or _join_options(values), {**values, **training}, error=str(error))
+    training = {key: getattr(fitting, key) for key in TRAINING_FIELDS}
+    columns = {**dataclasses.asdict(params), "n_features": params.length, **training}
+    return Candidate(name or describe_params(params), columns, params, fitting)
 
 
 def expand_grid(grid: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
@@ -188,7 +186,7 @@ def describe_params(params: FeatureParams) -> str:
 
 
 def _join_options(options: Mapping[str, Any]) -> str:
-    return " ".join(f"{key}={value}" for key, value in options.items() if key in FEATURE_FIELDS) or "default"
+    return " ".join(f"{key}={value}" for key, value in options.items()) or "default"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -226,23 +224,22 @@ class TrialOptions:
         return check_sequence(self.frames, "frames", "LabelledFrames")
 
 
-class TrialEvaluator:
-    """Trains and evaluates configurations on one set of patches."""
+class Trials:
+    """Trains and measures candidates on patches; the rows are in the order in which they were requested.
 
-    def __init__(self, patch_set: PatchSet, options: TrialOptions) -> None:
-        check_type(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
-        cache = options.cache
-        if not isinstance(cache, FeatureCache):
-            cache = FeatureCache(patch_set.patches, folder=cache, jobs=options.jobs)
-        elif cache.patches is not patch_set.patches:
-            raise InvalidInputError(
-                "cache must be a FeatureCache of the patches of patch_set; make one from patch_set.patches"
-            )
+    A trial that `store` holds is not measured again, and a new one is stored at once.
+    """
+
+    def __init__(self, patch_set: PatchSet, options: TrialOptions | None, store: RowStore) -> None:
+        options = TrialOptions() if options is None else options
+        check_type(options, "options", TrialOptions, "omit it for the defaults")
+        self.cache = open_cache(patch_set, options.cache, options.jobs)
         self.labels = patch_set.labels.astype(np.int64)
-        self.cache = cache
-        self.options = options
+        self.bar: Any = None  # progress bar of rows
+        self._options, self._store = options, store
+        self._rows: list[Mapping[str, Any]] = []
         self._search_ms: dict[FeatureParams, float] = {}
-        self._patches_digest = digest_of(cache.digest, self.labels)
+        self._patches_digest = digest_of(self.cache.digest, self.labels)
         used: dict[str, Any] = {}
         if options.time_search or options.frame_sets:
             used["search"] = dataclasses.asdict(options.search_params)
@@ -251,66 +248,91 @@ class TrialEvaluator:
             used["frames"] = [_digest_frames(each) for each in options.frame_sets]
         self._options_digest = digest_of(used, options.time_search)
 
-    def trial_id(self, config: TrialConfig, split: Split, seed: int, *, on_frames: bool = True) -> str:
-        """Hash of patches, configuration, split, seed and, with `on_frames`, the options and the frames.
+    def table(self) -> DataFrame:
+        """Rows so far."""
+        return make_table(self._rows, COLUMNS)
 
-        Of the frames only the labels count, not the pixels; nor do the version and the machine.
-        """
+    def run(
+        self, candidate: Candidate, split: Split, seed: int, *, split_name: str, stage: str
+    ) -> Mapping[str, Any]:
+        """Return the row of a trial, from the store or measured now; ``"halving"`` does not search frames."""
+        on_frames = stage != "halving"
+        # Of the frames only the labels count, not the pixels; nor do the version and the machine.
         options = self._options_digest if on_frames else None
-        return digest_of(self._patches_digest, config.to_columns(), split.train, split.test, seed, options)
+        trial = digest_of(self._patches_digest, candidate.columns, split.train, split.test, seed, options)
+        labels = {"stage": stage, "configuration": candidate.name, "split": split_name, "seed": seed}
+        row = self._store.get(trial) or self.measure(candidate, split, seed, on_frames) | candidate.columns
+        return self._add({**row, **labels, "trial": trial})
 
-    def evaluate(
-        self, config: TrialConfig, split: Split, seed: int, *, on_frames: bool = True
-    ) -> dict[str, Any]:
+    def add_impossible(self, candidate: Candidate, *, stage: str) -> None:
+        """Record an impossible combination."""
+        labels = {"stage": stage, "configuration": candidate.name}
+        trial = digest_of(candidate.columns, candidate.error)
+        error = {"status": "failed", "message": candidate.error}
+        self._add({**candidate.columns, **labels, **error, "trial": trial})
+
+    def _add(self, cells: Mapping[str, Any]) -> dict[str, Any]:
+        row = {name: cells.get(name) for name in COLUMNS}
+        self._rows.append(row)
+        self.bar.update()
+        if row["trial"] not in self._store:
+            self._store.add(row)
+            level = logging.WARNING if row["accuracy"] is None else logging.INFO
+            outcome = row["message"] or row["accuracy"]
+            _LOGGER.log(level, "%s, C=%s: %s: %s", row["configuration"], row["C"], row["status"], outcome)
+        return row
+
+    def measure(self, candidate: Candidate, split: Split, seed: int, on_frames: bool) -> dict[str, Any]:
         """Train and measure; the columns that a measurement fills."""
-        row: dict[str, Any] = {"train_size": len(split.train), "test_size": len(split.test)}
+        options, row = self._options, {"train_size": len(split.train), "test_size": len(split.test)}
         start = time.perf_counter()
         try:
-            classifier = self.train(config, split.train, seed)
+            classifier = self.train(candidate, split.train, seed)
         except InvalidInputError as error:
             return {"status": "failed", "message": str(error), **row}
-        row["fit_seconds"] = round(time.perf_counter() - start, 3)
-        row["train_accuracy"] = self.accuracy(classifier, split.train)
-        row["accuracy"] = self.accuracy(classifier, split.test)
-        if on_frames and (self.options.frame_sets or self.options.time_search):
+        measured = {"fit_seconds": round(time.perf_counter() - start, 3)}
+        for name, rows in (("train_accuracy", split.train), ("accuracy", split.test)):
+            features = self.cache.rows(classifier.params, rows)
+            measured[name] = classifier.score(features, self.labels[rows])
+        if on_frames and (options.frame_sets or options.time_search):
             try:
                 classifier.open_search(jobs=1).close()
             except InvalidInputError as error:
-                return {"status": "partial", "message": str(error), **row}
-            if self.options.time_search:
-                row["search_ms"] = self._time_search(classifier)
-            if self.options.frame_sets:
-                row |= self._score_frames(classifier)
-        return {"status": "ok", "message": None, **row}
+                return {"status": "partial", "message": str(error), **row, **measured}
+            if options.time_search:
+                measured["search_ms"] = self._time_search(classifier)
+            if options.frame_sets:
+                measured |= self._score_frames(classifier)
+        return {"status": "ok", **row, **measured}
 
-    def train(self, config: TrialConfig, rows: NDArray[np.intp], seed: int) -> VehicleClassifier:
+    def train(self, candidate: Candidate, rows: NDArray[np.intp], seed: int) -> VehicleClassifier:
         """Train on some of the patches; equal to `train_classifier` on them."""
+        assert candidate.params is not None
+        assert candidate.training is not None
         labels = check_labels(self.labels[rows], len(rows))
-        copies = (False, True) if config.training.mirror else (False,)
-        _check_memory(config.params.length, len(self.labels), len(rows), len(copies))
-        parts = [self.cache.rows(config.params, rows, mirrored=copy) for copy in copies]
-        features = np.concatenate(parts) if len(parts) > 1 else parts[0]
-        del parts  # As large as the joined features.
-        options = dataclasses.replace(config.training, random_state=seed)
-        return fit_features(features, labels, config.params, options)
-
-    def accuracy(self, classifier: VehicleClassifier, rows: NDArray[np.intp]) -> float:
-        """Fraction of correct predictions on some of the patches."""
-        return classifier.score(self.cache.rows(classifier.params, rows), self.labels[rows])
+        copies = (False, True) if candidate.training.mirror else (False,)
+        _check_memory(candidate.params.length, len(self.labels), len(rows), len(copies))
+        # One after the other, as the features of each copy are as large as the joined ones.
+        features = np.concatenate([self.cache.rows(candidate.params, rows, mirrored=copy) for copy in copies])
+        options = dataclasses.replace(candidate.training, random_state=seed)
+        return fit_features(features, labels, candidate.params, options)
 
     def _score_frames(self, classifier: VehicleClassifier) -> dict[str, Any]:
         """Mean of each metric over the sets of frames, and the F1 score of each set as text."""
-        scores = {each.name: self._score_set(classifier, each) for each in self.options.frame_sets}
-        row: dict[str, Any] = {}
-        for metric, values in zip(_FRAME_METRICS, zip(*scores.values())):
-            known = [value for value in values if not math.isnan(value)]
-            row[metric] = float(np.mean(known)) if known else None
+        scores = {each.name: self._score_set(classifier, each) for each in self._options.frame_sets}
+        import pandas as pd
+
+        # The mean of a metric without any value is NaN.
+        means = pd.DataFrame(scores, _FRAME_METRICS).mean(axis=1)
         by_set = "; ".join(f"{name} {f1:.4f}" for name, (f1, *_) in scores.items())
-        return {**row, "frame_f1_by_set": by_set}
+        return {**means, "frame_f1_by_set": by_set}
 
     def _score_set(self, classifier: VehicleClassifier, frames: LabelledFrames) -> tuple[float, ...]:
         """Values of `_FRAME_METRICS` on a set of frames."""
-        search, regions = self.options.search_params.with_horizon(frames.horizon), self.options.region_params
+        search, regions = (
+            self._options.search_params.with_horizon(frames.horizon),
+            self._options.region_params,
+        )
         with Detector(classifier, search_params=search, region_params=regions) as detector:
             found = TrackTable.from_detections({key: detector.detect(image) for key, image in frames})
         scores = evaluate_detections(found, frames.labels, frames=frames.keys)
@@ -326,62 +348,10 @@ class TrialEvaluator:
                 # The first run compiles kernels and allocates buffers.
                 for _ in range(_TIMED_RUNS + 1):
                     start = time.perf_counter()
-                    search.find(frame, self.options.search_params)
+                    search.find(frame, self._options.search_params)
                     seconds.append(time.perf_counter() - start)
             self._search_ms[classifier.params] = round(min(seconds[1:]) * 1000, 3)
         return self._search_ms[classifier.params]
-
-
-class TrialRunner:
-    """Runs trials that the store does not hold yet, and stores each new row at once."""
-
-    def __init__(self, evaluator: TrialEvaluator, store: RowStore, bar: Any) -> None:
-        self.evaluator = evaluator
-        self._store = store
-        self._bar = bar
-        self._rows: list[Mapping[str, Any]] = []
-
-    def table(self) -> DataFrame:
-        """Rows so far, in the order in which they were requested."""
-        return make_table(self._rows, COLUMNS)
-
-    def run(
-        self,
-        config: TrialConfig,
-        split: Split,
-        seed: int,
-        *,
-        name: str,
-        split_name: str,
-        stage: str,
-        on_frames: bool = True,
-    ) -> Mapping[str, Any]:
-        """Return the row of a trial, from the store or measured now."""
-        trial = self.evaluator.trial_id(config, split, seed, on_frames=on_frames)
-        labels = {"stage": stage, "configuration": name, "split": split_name, "seed": seed, "trial": trial}
-        if trial in self._store:
-            return self._append({**self._store[trial], **labels})
-        measured = self.evaluator.evaluate(config, split, seed, on_frames=on_frames)
-        row = self._append({**measured, **config.to_columns(), **labels})
-        self._store.add(row)
-        outcome = row["accuracy"] or row["message"]
-        _LOGGER.info("%s, C=%g, %s: %s", name, config.training.C, split_name, outcome)
-        return row
-
-    def add_failed(self, candidate: Candidate, *, stage: str) -> None:
-        """Record an impossible combination."""
-        trial = digest_of(dict(candidate.options), candidate.error)
-        labels = {"stage": stage, "configuration": candidate.name, "trial": trial}
-        row = self._append({**candidate.options, **labels, "status": "failed", "message": candidate.error})
-        if trial not in self._store:
-            self._store.add(row)
-            _LOGGER.warning("%s failed: %s", candidate.name, candidate.error)
-
-    def _append(self, cells: Mapping[str, Any]) -> dict[str, Any]:
-        row = {name: cells.get(name) for name in COLUMNS}
-        self._rows.append(row)
-        self._bar.update()
-        return row
 
 
 def _digest_frames(frames: LabelledFrames) -> str:

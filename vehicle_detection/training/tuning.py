@@ -32,16 +32,14 @@ from vehicle_detection.datasets import SEEDED_SPLITS, SPLIT_NAMES, PatchSet, Spl
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams
 from vehicle_detection.training.classifier import DEFAULT_C, check_labels
-from vehicle_detection.training.feature_cache import FeatureCache
+from vehicle_detection.training.feature_cache import FeatureCache, open_cache
 from vehicle_detection.training.results import RowStore, make_table
 from vehicle_detection.training.trials import (
     COLUMNS,
+    Candidate,
     Configuration,
-    TrialConfig,
-    TrialEvaluator,
     TrialOptions,
-    TrialRunner,
-    describe_params,
+    Trials,
     expand_grid,
     read_configurations,
 )
@@ -114,33 +112,21 @@ def compare_configurations(
         raise InvalidInputError("C must be a number or several; got none")
     for value in values:
         check_number(value, "C")
-    checked_seeds = check_seeds(seeds)
-    if options is not None:
-        check_type(options, "options", TrialOptions, "omit it for the defaults")
-    # A configuration that sets C itself is tried with that value only.
-    candidates = [
-        candidate
-        for number, value in enumerate(values)
-        for candidate in read_configurations(configurations, C=value)
-        if number == 0 or "C" not in candidate.options
-    ]
-    evaluator = TrialEvaluator(patch_set, options or TrialOptions())
-    trials = list(make_splits(patch_set, splits, checked_seeds))
-    rows = RowStore(store, COLUMNS)
+    candidates = read_configurations(configurations, values)
+    parts = list(make_splits(patch_set, splits, check_seeds(seeds)))
+    trials = Trials(patch_set, options, RowStore(store, COLUMNS))
     # Candidates with the same features follow each other, so that a small cache computes them once.
     order = {name: place for place, name in enumerate(dict.fromkeys(each.name for each in candidates))}
     candidates.sort(key=lambda candidate: order[candidate.name])
-    total = sum(1 if candidate.config is None else len(trials) for candidate in candidates)
-    with progress_bar(progress, total, unit="trial") as bar:
-        runner = TrialRunner(evaluator, rows, bar)
+    total = sum(1 if candidate.error else len(parts) for candidate in candidates)
+    with progress_bar(progress, total, unit="trial") as trials.bar:
         for candidate in candidates:
-            if candidate.config is None:
-                runner.add_failed(candidate, stage="compare")
+            if candidate.error:
+                trials.add_impossible(candidate, stage="compare")
                 continue
-            name, config = candidate.name, candidate.config
-            for split_name, seed, split in trials:
-                runner.run(config, split, seed, name=name, split_name=split_name, stage="compare")
-    return runner.table()
+            for name, seed, split in parts:
+                trials.run(candidate, split, seed, split_name=name, stage="compare")
+    return trials.table()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,26 +191,22 @@ def search_parameters(
     halving = Halving() if halving is None else halving
     check_type(halving, "halving", Halving, "omit it for the default")
     seed = check_integer(random_state, "random_state", low=0, high=2**32 - 1)
-    if options is not None:
-        check_type(options, "options", TrialOptions, "omit it for the defaults")
-    candidates = read_configurations(expand_grid(grid), C=DEFAULT_C)
-    names = {each.config: each.name for each in candidates if each.config is not None}
-    if not names:
+    candidates = read_configurations(expand_grid(grid))
+    possible = [each for each in candidates if not each.error]
+    if not possible:
         raise InvalidInputError(f"grid holds no possible combination: {candidates[0].error}")
-    evaluator = TrialEvaluator(patch_set, options or TrialOptions())
-    rows = RowStore(store, COLUMNS)
+    trials = Trials(patch_set, options, RowStore(store, COLUMNS))
     fold_of = make_folds(patch_set, split, halving.n_folds, seed)
-    with progress_bar(progress, unit="trial") as bar:
-        runner = TrialRunner(evaluator, rows, bar)
+    with progress_bar(progress, unit="trial") as trials.bar:
         for candidate in candidates:
-            if candidate.config is None:
-                runner.add_failed(candidate, stage="grid")
-        ranked = _halve(runner, list(names), fold_of, halving, split=split, seed=seed)
+            if candidate.error:
+                trials.add_impossible(candidate, stage="grid")
+        ranked = _halve(trials, list(dict.fromkeys(possible)), fold_of, halving, split=split, seed=seed)
         if halving.n_finalists:
             ((name, _, parts),) = make_splits(patch_set, split, (seed,))
-            for config in ranked[: halving.n_finalists]:
-                runner.run(config, parts, seed, name=names[config], split_name=name, stage="final")
-    return runner.table()
+            for candidate in ranked[: halving.n_finalists]:
+                trials.run(candidate, parts, seed, split_name=name, stage="final")
+    return trials.table()
 
 
 def make_folds(patch_set: PatchSet, split: str, n_folds: int, seed: int) -> NDArray[np.intp]:
@@ -253,77 +235,61 @@ def make_folds(patch_set: PatchSet, split: str, n_folds: int, seed: int) -> NDAr
 
 
 def _halve(
-    runner: TrialRunner,
-    configs: Sequence[TrialConfig],
+    trials: Trials,
+    candidates: list[Candidate],
     fold_of: NDArray[np.intp],
     halving: Halving,
     *,
     split: str,
     seed: int,
-) -> list[TrialConfig]:
-    """Drop the worse configurations round by round, on more and more patches; return them best first."""
+) -> list[Candidate]:
+    """Drop the worse candidates round by round, on more and more patches; return them best first."""
+    from sklearn.base import BaseEstimator, ClassifierMixin
     from sklearn.experimental import enable_halving_search_cv  # noqa: F401 - enables the next import
     from sklearn.model_selection import HalvingGridSearchCV, HalvingRandomSearchCV, PredefinedSplit
 
-    # One parameter that holds whole configurations: impossible combinations are never candidates.
-    values: dict[str, Any] = {"config": list(configs)}
-    count = min(halving.n_candidates or len(configs), len(configs))
-    factor = halving.factor
-    n_rounds = int(math.log(count, factor) + 1e-9)
-    n_patches = len(fold_of)
+    class Trial(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+        """An estimator over row numbers; its score runs the trial, as only then both sides are known."""
+
+        def __init__(self, candidate: Candidate | None = None) -> None:
+            self.candidate = candidate
+
+        def fit(self, X: NDArray[np.intp], y: NDArray[np.int64]) -> Trial:
+            self.classes_, self.rows_ = np.unique(y), np.sort(X[:, 0])
+            return self
+
+        def score(self, X: NDArray[np.intp], y: NDArray[np.int64]) -> float:
+            assert self.candidate is not None
+            parts = Split(self.rows_, np.sort(X[:, 0]))
+            fold = f"{split}, fold {fold_of[parts.test[0]] + 1} of {halving.n_folds}"
+            row = trials.run(self.candidate, parts, seed, split_name=fold, stage="halving")
+            return math.nan if row["accuracy"] is None else float(row["accuracy"])
+
+    count, n_patches = min(halving.n_candidates or len(candidates), len(candidates)), len(fold_of)
+    n_rounds = int(math.log(count, halving.factor) + 1e-9)
     options: dict[str, Any] = {
-        "estimator": _make_estimator(runner, fold_of, split, seed),
-        "factor": factor,
-        "min_resources": min(n_patches, max(n_patches // factor**n_rounds, _MIN_PATCHES)),
+        "factor": halving.factor,
+        "min_resources": min(n_patches, max(n_patches // halving.factor**n_rounds, _MIN_PATCHES)),
         "cv": PredefinedSplit(fold_of),
         "error_score": "raise",
         "return_train_score": False,
         "refit": False,
         "random_state": seed,
     }
-    if count < len(configs):
-        search = HalvingRandomSearchCV(param_distributions=values, n_candidates=count, **options)
+    # One parameter that holds whole candidates: impossible combinations are never among them.
+    if count < len(candidates):
+        search = HalvingRandomSearchCV(Trial(), {"candidate": candidates}, n_candidates=count, **options)
     else:
-        search = HalvingGridSearchCV(param_grid=values, **options)
+        search = HalvingGridSearchCV(Trial(), {"candidate": candidates}, **options)
     with warnings.catch_warnings():
-        # A configuration that cannot be trained has no score; the message of its row gives the reason.
+        # A candidate that cannot be trained has no score; the message of its row gives the reason.
         warnings.filterwarnings("ignore", message="One or more of the test scores are non-finite")
-        search.fit(np.arange(n_patches)[:, None], runner.evaluator.labels)
+        search.fit(np.arange(n_patches)[:, None], trials.labels)
     results = search.cv_results_
     # Order by the last round reached, then by score; NaN comes last.
     scores = np.nan_to_num(results["mean_test_score"], nan=-1.0)
     order = np.lexsort((-scores, -results["iter"]))
-    ranked = [results["params"][index]["config"] for index in order if scores[index] >= 0]
-    return list(dict.fromkeys(ranked))
-
-
-def _make_estimator(runner: TrialRunner, fold_of: NDArray[np.intp], split: str, seed: int) -> Any:
-    """Build an estimator over row numbers; its score runs the trial, as only then both sides are known."""
-    from sklearn.base import BaseEstimator, ClassifierMixin
-
-    class Trial(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
-        def __init__(self, config: TrialConfig | None = None) -> None:
-            self.config = config
-
-        def fit(self, X: NDArray[np.intp], y: NDArray[np.int64]) -> Trial:
-            self.classes_ = np.unique(y)
-            self.rows_ = X[:, 0]
-            return self
-
-        def score(self, X: NDArray[np.intp], y: NDArray[np.int64]) -> float:
-            assert self.config is not None
-            row = runner.run(
-                self.config,
-                Split(np.sort(self.rows_), np.sort(X[:, 0])),
-                seed,
-                name=describe_params(self.config.params),
-                split_name=f"{split}, fold {fold_of[X[0, 0]] + 1} of {fold_of.max() + 1}",
-                stage="halving",
-                on_frames=False,
-            )
-            return math.nan if row["accuracy"] is None else float(row["accuracy"])
-
-    return Trial()
+    return list(dict.fromkeys(results["params"][row]["candidate"] for row in order if scores[row] >= 0))
 
 
 def make_splits(
@@ -415,17 +381,17 @@ def compare_classifiers(
     models = _check_classifiers(default if classifiers is None else classifiers)
     chosen = FeatureParams() if params is None else params
     check_type(chosen, "params", FeatureParams, "pass FeatureParams() or a preset")
+    X, labels = open_cache(patch_set, cache, jobs).all(chosen), patch_set.labels.astype(np.int64)
     trials = list(make_splits(patch_set, splits, check_seeds(seeds)))
-    evaluator = TrialEvaluator(patch_set, TrialOptions(cache=cache, jobs=jobs, time_search=False))
     for _, _, split in trials:
-        check_labels(evaluator.labels[split.train], len(split.train))
-    X, rows = evaluator.cache.all(chosen), []
+        check_labels(labels[split.train], len(split.train))
+    rows = []
     with progress_bar(progress, len(models), unit="classifier") as bar:
         for name, model in models.items():
             scores = cross_validate(
                 make_pipeline(StandardScaler(), model),
                 X,
-                evaluator.labels,
+                labels,
                 cv=[tuple(split) for _, _, split in trials],
                 scoring=_score_classifier,
                 error_score="raise",
