@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.feature_cases import BLANK, PATCHES
 from tests.helpers import rendered_patches
 from vehicle_detection._kernels import features as kernels
-from vehicle_detection._kernels.features import bin_of_value, degree_bounds, orientation_cotangents
+from vehicle_detection._kernels.features import degree_bounds, orientation_cotangents
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
     COLOR_SPACES,
@@ -183,31 +183,6 @@ def test_the_kernel_bins_all_uint8_gradients_like_the_reference(orient):
         assert ((middles != 0).sum(axis=0) == filled).all()
 
 
-def test_reference_bins_equal_scikit_image():
-    rng = np.random.default_rng(0)
-    channel = rng.choice(np.array([0, 10, 20, 200], np.uint8), (66, 66))
-    for orient in (4, 9, 12):
-        # Blocks of one cell are normalized separately, so only test which bins are filled.
-        found = hog_blocks(channel, orient, 2, 1)[:, :, 0, 0] > 0
-        values = channel.astype(int)
-        gx, gy = np.zeros_like(values), np.zeros_like(values)
-        gx[:, 1:-1] = values[:, 2:] - values[:, :-2]
-        gy[1:-1] = values[2:] - values[:-2]
-        bins = np.where((gx != 0) | (gy != 0), reference_bins(gx, gy, orient), -1)
-        cells = bins.reshape(33, 2, 33, 2).transpose(0, 2, 1, 3).reshape(33, 33, 4)
-        expected = (cells[..., None] == np.arange(orient)).any(axis=2)
-        np.testing.assert_array_equal(found, expected)
-
-
-@given(st.integers(1, 256))
-def test_histogram_bins_equal_numpy(bins):
-    values = np.arange(256)
-    expected = [int(np.histogram([value], bins=bins, range=(0, 256))[0].argmax()) for value in values[::5]]
-    assert bin_of_value(bins)[::5].tolist() == expected
-    counts = np.histogram(values, bins=bins, range=(0, 256))[0]
-    np.testing.assert_array_equal(np.bincount(bin_of_value(bins), minlength=bins), counts)
-
-
 @pytest.mark.parametrize("preset", ["luv-2384", "ycrcb-6156"])
 def test_threads_do_not_change_the_features(preset):
     params = FeatureParams.preset(preset)
@@ -288,46 +263,11 @@ def test_invalid_sources(source, message):
         extract_features(source)
 
 
-def test_invalid_arguments_of_single_img_features():
-    with pytest.raises(InvalidInputError, match=r"image\[0\] must be 64x64 pixels, got 64x32"):
-        single_img_features(BLANK[:32])
-    with pytest.raises(InvalidInputError, match=r"image\[0\] must be an \(H, W, 3\)"):
-        single_img_features(BLANK / 255)
-
-
 @pytest.mark.parametrize("params", ["luv-2384", {"orient": 9}, FeatureParams, 5, False])
 def test_invalid_params(params):
     for extract in (lambda: extract_features(PATCHES, params), lambda: single_img_features(BLANK, params)):
         with pytest.raises(InvalidInputError, match=r"params must be a FeatureParams, got .*; pass Feature"):
             extract()
-
-
-def test_the_coarse_hog_equals_hog_of_larger_cells():
-    fine = FeatureParams(hog_channel=0, orient=8)
-    params = dataclasses.replace(fine, coarse_hog=True)
-    patch = PATCHES[-1]
-    coarse = get_hog_features(convert_color(patch)[..., 0], 8, 16)
-    for extract in (single_img_features, lambda patch, params: extract_features([patch], params)[0]):
-        vector = extract(patch, params)
-        np.testing.assert_array_equal(vector[: fine.length], extract(patch, fine))
-        np.testing.assert_allclose(vector[fine.length :], coarse, atol=TOLERANCE)
-
-
-def test_square_roots_of_the_histogram():
-    plain = FeatureParams(spatial_feat=False, hog_feat=False)
-    counts = extract_features(PATCHES, plain)
-    roots = extract_features(PATCHES, dataclasses.replace(plain, hist_sqrt=True))
-    np.testing.assert_allclose(roots**2, counts, rtol=1e-6)
-    # The counts of a channel sum to the number of pixels.
-    np.testing.assert_allclose((roots**2).sum(axis=1), 3 * 64 * 64, rtol=1e-6)
-
-
-def test_hog_ignores_contrast_and_brightness():
-    channel = cv2.GaussianBlur(PATCHES[0][..., 0] // 3, (0, 0), 2)
-    values = get_hog_features(channel)
-    assert ((values >= 0) & (values <= 1)).all()
-    np.testing.assert_allclose(get_hog_features(channel + 50), values, atol=1e-9)
-    np.testing.assert_allclose(get_hog_features(channel * 2), values, atol=1e-4)
 
 
 def test_one_edge_fills_one_orientation():
@@ -365,16 +305,6 @@ def test_the_smallest_image_for_hog():
         hog_blocks(BLANK[..., 0], 9, 8, 0)
 
 
-def test_hog_image_shows_edges():
-    channel = np.zeros((64, 64), np.uint8)
-    channel[:, 20:] = 200
-    picture = hog_image(channel)
-    assert picture.shape == (64, 64)
-    assert picture[:, 16:24].sum() > 0
-    assert picture[:, 40:].sum() == 0
-    assert hog_image(channel[:8, 16:24]).sum() > 0  # one cell
-
-
 def test_bin_spatial_is_ordered_by_channel():
     image = np.zeros((64, 64, 3), np.uint8)
     image[..., 1] = 7
@@ -383,12 +313,6 @@ def test_bin_spatial_is_ordered_by_channel():
     np.testing.assert_array_equal(bin_spatial(PATCHES[0], (32, 32)), bin_spatial(PATCHES[0]))
     np.testing.assert_array_equal(bin_spatial(PATCHES[0], np.int64(32)), bin_spatial(PATCHES[0]))
     assert bin_spatial(PATCHES[0], (4, 2)).shape == (24,)
-
-
-@pytest.mark.parametrize("size", [0, (32, 0), (1, 2, 3), 1.5, "32", None])
-def test_invalid_size_of_bin_spatial(size):
-    with pytest.raises(InvalidInputError, match="size must be"):
-        bin_spatial(PATCHES[0], size)
 
 
 def test_color_hist_counts_all_pixels():

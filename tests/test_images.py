@@ -138,20 +138,6 @@ def test_a_truncated_jpeg_with_a_complete_thumbnail_is_refused(picture):
         decode_image(with_thumbnail[: -len(whole) // 3], "a.jpg")
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_bytes_after_the_image_are_ignored(picture, suffix):
-    # Phones append previews and maker's notes.
-    data = encoded(suffix, bgr(picture))
-    np.testing.assert_array_equal(decode_image(data + bytes(10_000), "a"), decode_image(data, "a"))
-
-
-def test_a_damaged_png_is_refused(picture):
-    data = bytearray(encoded(".png", bgr(picture)))
-    data[len(data) // 2] ^= 0x10
-    with pytest.raises(InvalidInputError, match="cannot be decoded"):
-        decode_image(bytes(data), "damaged.png")
-
-
 def claim(data, width, height):
     """Change the size that the header of a PNG or JPEG claims."""
     data = bytearray(data)
@@ -199,14 +185,6 @@ def test_the_size_of_an_image_is_that_of_its_header(suffix):
         assert image_size(data[:length]) in (None, (53, 37))
 
 
-def test_the_size_of_other_kinds_of_header():
-    lossless = cv2.imencode(".webp", np.zeros((37, 53, 4), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 101])[1]
-    assert image_size(lossless.tobytes()) == (53, 37)
-    progressive = cv2.imencode(".jpg", np.zeros((37, 53, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1]
-    assert image_size(progressive.tobytes()) == (53, 37)
-    assert image_size(b"MM\0+" + bytes(40)) is None
-
-
 def test_a_pipe_or_device_is_no_image(tmp_path):
     pipe = tmp_path / "pipe.png"
     os.mkfifo(pipe)
@@ -221,16 +199,6 @@ def test_a_file_without_an_image_is_refused(tmp_path, content):
     file.write_bytes(content)
     with pytest.raises(InvalidInputError, match=r"a.png must be a complete image file"):
         read_image(file)
-
-
-def test_an_unreadable_file(tmp_path, monkeypatch):
-    def refuse(self, mode):
-        raise PermissionError(13, "Permission denied")
-
-    (tmp_path / "a.png").touch()
-    monkeypatch.setattr(Path, "open", refuse)
-    with pytest.raises(InvalidInputError, match=r"a.png cannot be read: Permission denied"):
-        read_image(tmp_path / "a.png")
 
 
 def test_a_failed_write_keeps_the_earlier_file(tmp_path, picture, monkeypatch):
@@ -271,9 +239,3 @@ def test_bad_paths_and_images(tmp_path, monkeypatch, picture, call, message):
     with pytest.raises(InvalidInputError, match=message):
         call(picture)
     assert os.listdir(tmp_path) == ["folder.png"]
-
-
-def test_a_folder_that_is_not_writable(tmp_path, picture, monkeypatch):
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    with pytest.raises(InvalidInputError, match="path needs a writable folder"):
-        write_image(tmp_path / "a.png", picture)

@@ -24,26 +24,6 @@ ALL = [FeatureParams(), BAND, SEARCH, HeatParams(), RegionParams(), TrackParams(
 FRAMES = [(720, 1280), (540, 960), (375, 1242), (360, 480), (1280, 720), (2160, 3840), (1080, 1920)]
 
 
-def class_name(params):
-    return type(params).__name__
-
-
-@pytest.mark.parametrize("params", ALL, ids=class_name)
-def test_parameters_are_frozen_and_hashable(params):
-    name = dataclasses.fields(params)[0].name
-    with pytest.raises(dataclasses.FrozenInstanceError, match=name):
-        setattr(params, name, 1)
-    assert dataclasses.replace(params) == params
-    assert hash(dataclasses.replace(params)) == hash(params)
-
-
-@pytest.mark.parametrize("params", ALL, ids=class_name)
-def test_parameters_are_keyword_only(params):
-    first = getattr(params, dataclasses.fields(params)[0].name)
-    with pytest.raises(TypeError, match="positional"):
-        type(params)(first)
-
-
 @pytest.mark.parametrize("value", ["nonsense", None, math.nan, -1e12, [1, 2]], ids=repr)
 @pytest.mark.parametrize(
     ("params", "field"), [(params, field.name) for params in ALL for field in dataclasses.fields(params)]
@@ -98,24 +78,6 @@ def test_features_have_the_known_lengths(params, parts):
 def test_invalid_parameters_are_rejected(kind, arguments, message):
     with pytest.raises(InvalidInputError, match=message):
         kind(**arguments)
-
-
-def test_coarse_hog_is_the_last_part_of_hog():
-    params = FeatureParams(coarse_hog=True)
-    assert (params.coarse_blocks, params.coarse_length) == (3, 3 * 3 * 4 * 9 * 3)
-    assert params.hog_length == 5292 + params.coarse_length
-    assert params.length == 768 + 96 + params.hog_length
-    assert FeatureParams(coarse_hog=True, cell_per_block=4).coarse_length == 4 * 4 * 9 * 3
-    assert FeatureParams(coarse_hog=True, hog_feat=False).length == 768 + 96
-    assert (FeatureParams().coarse_blocks, FeatureParams().coarse_length) == (0, 0)
-
-
-def test_gains_apply_to_their_parts():
-    params = FeatureParams(coarse_hog=True, hist_gain=3, coarse_gain=2)
-    expected = np.repeat([1.0, 3.0, 1.0, 2.0], [768, 96, 5292, 972])
-    np.testing.assert_array_equal(params.gains, expected)
-    assert (FeatureParams(hist_gain=3, hist_feat=False, coarse_gain=2).gains == 1).all()
-    assert (FeatureParams().gains == 1).all()
 
 
 def test_the_color_spaces_of_the_parts():

@@ -127,25 +127,11 @@ def test_other_features_equal_the_reference(changes):
     assert_equals_the_reference(IMAGE, band_of((80, 80), x=(5, 213), y=(40, 152)), classifier)
 
 
-@pytest.mark.parametrize("window", [(96, 64), (48, 96), (110, 145), (40, 33)])
-@pytest.mark.parametrize("preset", ["ycrcb-6156", "luv-2384"])
-def test_windows_that_are_not_square(window, preset):
-    band = band_of(window, x=(0, 330), y=(20, 20 + round(1.4 * window[1])))
-    assert_equals_the_reference(IMAGE, band, random_classifier(FeatureParams.preset(preset)))
-
-
 @pytest.mark.parametrize("height", range(64, 74))
 def test_bands_of_any_height(height):
     # Rows below the last whole cell still affect the gradients of the cell above them.
     band = band_of((64, 64), x=(3, 3 + height + 17), y=(11, 11 + height))
     assert_equals_the_reference(IMAGE, band, random_classifier(FeatureParams(hog_channel=0)))
-
-
-def test_a_wide_band():
-    # Wider than the tiles of the HOG kernel.
-    image = textured(80, 1300, 4)
-    band = PixelBand(0, 0, 1300, 70, (64, 64), (8, 8))
-    assert_equals_the_reference(image, band, random_classifier(FeatureParams.preset("ycrcb-6156")))
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -191,16 +177,6 @@ def test_two_templates_give_the_maximum_score(preset):
     assert (alone[0] < alone[1]).any()
 
 
-def test_flat_and_extreme_images():
-    classifier = random_classifier(FeatureParams())
-    for image in (np.zeros_like(IMAGE), np.full_like(IMAGE, 255), np.full_like(IMAGE, (250, 3, 128))):
-        with classifier.open_search(1) as search:
-            band = band_of((64, 64), x=(0, 120), y=(0, 90))
-            np.testing.assert_allclose(
-                search.score_map(image, band), reference_map(image, band, classifier), atol=TOLERANCE
-            )
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -242,21 +218,6 @@ def test_threads_and_strides_do_not_change_the_result(params, templates):
         np.testing.assert_array_equal(found.boxes, one.boxes)
         np.testing.assert_array_equal(found.scores, one.scores)
     np.testing.assert_array_equal(image, IMAGE)
-
-
-def test_a_search_can_be_reused():
-    classifier = random_classifier(SMALL)
-    search = small_params()
-    images = [textured(220, 330, seed) for seed in range(3)] + [textured(110, 165, 9)]
-    fresh = [find_cars(image, classifier, search, jobs=1) for image in images]
-    with classifier.open_search(2) as bands:
-        for image, expected in zip(images * 2, fresh * 2):
-            found = bands.find_windows(image, search)
-            np.testing.assert_array_equal(found.boxes, expected.boxes)
-            np.testing.assert_array_equal(found.scores, expected.scores)
-        bands.close()
-        # A closed search restarts its threads.
-        assert len(bands.find_windows(images[0], search)) == len(fresh[0])
 
 
 def test_a_score_map_is_not_overwritten_by_the_next_search():
@@ -371,26 +332,6 @@ def test_the_three_scales_have_11580_windows():
     assert [int((sizes == side).sum()) for side in (96, 64, 51)] == [1386, 3825, 6369]
     first = found.boxes[:1386]
     assert (np.lexsort((first[:, 0], first[:, 1])) == np.arange(1386)).all()
-
-
-def test_windows_above_the_minimum_score_are_found():
-    classifier = random_classifier(SMALL)
-    every = find_cars(IMAGE, classifier, small_params(min_score=-1e6))
-    min_score = float(np.quantile(every.scores, 0.9))
-    some = find_cars(IMAGE, classifier, small_params(min_score=min_score))
-    np.testing.assert_array_equal(some.boxes, every.boxes[every.scores > min_score])
-    np.testing.assert_array_equal(some.scores, every.scores[every.scores > min_score])
-    assert len(find_cars(IMAGE, classifier, small_params(min_score=1e6))) == 0
-
-
-@pytest.mark.parametrize("shape", [(720, 1280), (540, 960), (375, 1242), (360, 480), (1280, 720)])
-def test_the_default_search_runs_on_the_usual_frames(shape):
-    search = dataclasses.replace(SearchParams.preset(), min_score=-1e6)
-    classifier = random_classifier(FeatureParams(hog_feat=False, hist_feat=False, spatial_size=8))
-    found = find_cars(np.zeros((*shape, 3), np.uint8), classifier, search)
-    assert len(found) > 100
-    assert (found.boxes[:, 1] >= 0).all()
-    assert (found.boxes[:, 3] <= shape[0] + 1e-9).all()
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
-from sklearn.linear_model import LogisticRegression, LogisticRegressionCV, RidgeClassifier, SGDClassifier
+from sklearn.linear_model import LogisticRegression, RidgeClassifier, SGDClassifier
 from sklearn.model_selection import GridSearchCV
 from sklearn.naive_bayes import GaussianNB
-from sklearn.pipeline import Pipeline, make_pipeline
+from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MaxAbsScaler, MinMaxScaler, RobustScaler, StandardScaler
 from sklearn.svm import SVC, LinearSVC
 
@@ -37,21 +37,6 @@ def assert_same_scores(classifier, pipeline, rows):
     """Up to the precision of float32."""
     expected = pipeline.decision_function(rows)
     np.testing.assert_allclose(classifier.decision_function(rows), expected, rtol=1e-4, atol=1e-4)
-
-
-def test_from_an_own_pipeline(patches, labels):
-    features = PatchFeatures(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
-    pipeline = make_pipeline(features, StandardScaler(), LinearSVC(C=0.01, random_state=0))
-    pipeline.fit(patches, labels.astype(bool))
-    assert_same_scores(VehicleClassifier.from_pipeline(pipeline, SMALL), pipeline, patches)
-
-
-@pytest.mark.parametrize("options", [{"with_mean": False}, {"with_std": False}])
-def test_from_a_pipeline_without_mean_or_scale(patches, labels, options):
-    rows = extract_features(patches, SMALL)
-    pipeline = make_pipeline(StandardScaler(**options), LinearSVC(C=1e-3, random_state=0, max_iter=20_000))
-    pipeline.fit(rows, labels)
-    assert_same_scores(VehicleClassifier.from_pipeline(pipeline, SMALL), pipeline, rows)
 
 
 def published_features(patches, size=8):
@@ -110,21 +95,6 @@ def test_a_grid_search_over_the_features(patches, labels):
     assert VehicleClassifier.from_pipeline(search, gained).params == gained
     with pytest.raises(InvalidInputError, match="params must equal those of the pipeline"):
         VehicleClassifier.from_pipeline(search, SMALL)
-
-
-def test_a_search_over_the_classifier_alone(patches, labels):
-    rows = extract_features(patches, SMALL)
-    search = GridSearchCV(LinearSVC(), {"C": [1e-3, 1e-2]}, cv=2)
-    pipeline = Pipeline([("none", "passthrough"), ("scale", StandardScaler()), ("svm", search)])
-    pipeline.fit(rows, labels)
-    assert_same_scores(VehicleClassifier.from_pipeline(pipeline, SMALL), pipeline, rows)
-
-
-@pytest.mark.filterwarnings("ignore::FutureWarning")
-def test_a_classifier_that_searches_its_own_parameter(patches, labels):
-    rows = StandardScaler().fit_transform(extract_features(patches, SMALL))
-    fitted = LogisticRegressionCV(Cs=[1e-3, 1e-2], cv=2).fit(rows, labels)
-    assert_same_scores(VehicleClassifier.from_pipeline(fitted, SMALL), fitted, rows)
 
 
 class StandardScale(StandardScaler):
@@ -205,15 +175,6 @@ def test_estimators_of_old_versions_lack_the_number_of_features(patches, labels,
     np.testing.assert_array_equal(found, expected)
     with pytest.raises(InvalidInputError, match=f"its {type(scaler).__name__} was fitted on"):
         VehicleClassifier.from_pipeline((svc, scaler), dataclasses.replace(SMALL, orient=5))
-
-
-@pytest.mark.parametrize("scaler", [StandardScaler(with_mean=False), RobustScaler(with_centering=False)])
-@pytest.mark.parametrize("color_space", ["RGB", "HSV", "LUV", "LAB"])
-def test_a_model_of_uint8_images_needs_no_centering(patches, labels, color_space, scaler):
-    params = dataclasses.replace(SMALL, color_space=color_space)
-    rows = extract_features(patches, params)
-    model = make_pipeline(scaler, LinearSVC(C=1e-3, max_iter=20_000)).fit(rows, labels)
-    assert VehicleClassifier.from_pipeline(model, params).params == params
 
 
 @pytest.mark.parametrize("color_space", ["RGB", "YCrCb", "HSV", "HLS"])

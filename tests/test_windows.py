@@ -9,7 +9,7 @@ from vehicle_detection import course
 from vehicle_detection.course.reference import score_windows
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, single_img_features
-from vehicle_detection.search import PixelBand, SearchParams
+from vehicle_detection.search import SearchParams
 from vehicle_detection.training import to_pipeline
 from vehicle_detection.windows import band_windows, search_windows, slide_window
 
@@ -68,15 +68,6 @@ def test_the_arguments_are_not_modified():
     np.testing.assert_array_equal(IMAGE, before)
 
 
-def test_steps_do_not_lose_a_pixel_to_rounding():
-    # 110 * (1 - 0.7) is 33.000000000000004, 64 * (1 - 0.9) is 6.399999999999999, 50 * (1 - 0.9) is 4.99...
-    for side, overlap, step in [(110, 0.7, 33), (64, 0.9, 6), (50, 0.9, 5), (8, 0.99, 1), (64, 0.875, 8)]:
-        found = slide_window(
-            np.zeros((side, 400, 3), np.uint8), xy_window=(side, side), xy_overlap=(overlap, 0)
-        )
-        assert found[1, 0] - found[0, 0] == step
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -98,13 +89,6 @@ def test_slide_window_rejects_invalid_arguments(arguments, message):
     arguments = {"image": IMAGE, **arguments}
     with pytest.raises(InvalidInputError, match=message):
         slide_window(arguments.pop("image"), **arguments)
-
-
-def test_windows_of_a_placed_band():
-    band = PixelBand(-10, 5, 50, 45, (20, 30), (15, 7))
-    assert band_windows(band).tolist() == [
-        [x, y, x + 20, y + 30] for y in (5, 12) for x in (-10, 5, 20) if x + 20 <= 50
-    ]
 
 
 def test_the_window_list_of_the_first_system():
@@ -148,15 +132,6 @@ def test_windows_above_the_minimum_score_are_returned():
     np.testing.assert_array_equal(default.boxes, windows[every.scores > 0])
     none = search_windows(IMAGE, slide_window(image_of(64, 63)), CLASSIFIER, min_score=None)
     assert none.boxes.shape == (0, 4)
-
-
-def test_threads_and_order_do_not_change_scores():
-    windows = slide_window(IMAGE, xy_window=(30, 30), xy_overlap=(0.8, 0.8))
-    one = search_windows(IMAGE, windows, CLASSIFIER, min_score=None, jobs=1)
-    two = search_windows(IMAGE, windows, CLASSIFIER, min_score=None, jobs=2)
-    np.testing.assert_array_equal(one.scores, two.scores)
-    backwards = search_windows(IMAGE, windows[::-1], CLASSIFIER, min_score=None)
-    np.testing.assert_allclose(backwards.scores[::-1], one.scores, rtol=1e-9, atol=1e-9)
 
 
 def test_both_borders_differ_only_in_the_gradients():
@@ -209,12 +184,3 @@ def test_search_windows_rejects_other_invalid_arguments():
     for off_grid in ([[3, 0, 67, 64]], [[0, 0, 48, 48]]):
         with pytest.raises(InvalidInputError, match="windows must be 64x64 pixels, at multiples of 16"):
             score_windows(IMAGE, off_grid, CLASSIFIER)
-
-
-def test_search_windows_does_not_modify_its_arguments():
-    windows = slide_window(IMAGE)
-    image, boxes = IMAGE.copy(), windows.astype(float)
-    search_windows(image, boxes, CLASSIFIER)
-    score_windows(image, boxes, CLASSIFIER)
-    np.testing.assert_array_equal(image, IMAGE)
-    np.testing.assert_array_equal(boxes, windows)

@@ -12,7 +12,6 @@ import vehicle_detection
 from tests.cli.commands import (
     COMMANDS,
     contents,
-    failing,
     finish,
     patches_of,
     refuse,
@@ -22,7 +21,6 @@ from tests.cli.commands import (
     start_changed,
     succeed,
 )
-from vehicle_detection import detector
 from vehicle_detection._common import files as _files
 from vehicle_detection.cli.app import app
 from vehicle_detection.cli.demo import draw_clip
@@ -39,15 +37,6 @@ def test_options_are_listed_in_panels():
     titles = re.findall(r"^╭─ (\w+) ─", page, re.MULTILINE)
     assert titles == ["Arguments", "Options", "Output", "Input", "Camera", "Search", "Drawing"]
     assert re.search(r"--live\s+Drop frames", page), "an option without a value has no type"
-
-
-def test_shells_complete_commands_and_options():
-    words = {"vehicle-detection ev": ["evaluate"], "vehicle-detection video --pa": ["--panel"]}
-    for typed, expected in words.items():
-        variables = {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
-        variables["_VEHICLE_DETECTION_COMPLETE"] = "complete_bash"
-        process = start(env={**os.environ, **variables})
-        assert finish(process) == (0, "\n".join(expected) + "\n", "")
 
 
 def test_every_command_has_help_that_loads_no_heavy_library():
@@ -114,19 +103,6 @@ def test_ctrl_c_leaves_nothing_behind(tmp_path, material):
         assert finish(process) == (130, "", "interrupted\n")
     assert contents(out) == []
     assert not (tmp_path / "demo").exists()
-
-
-def test_an_interrupted_command_leaves_no_file(monkeypatch, picture, tmp_path):
-    monkeypatch.setattr(detector.Detector, "detect", failing(KeyboardInterrupt()))
-    result = run("detect", picture, "-o", tmp_path / "a" / "b", "--boxes", tmp_path / "boxes.csv")
-    assert (result.exit_code, result.stdout, result.stderr) == (130, "", "interrupted\n")
-    assert contents(tmp_path) == []
-
-
-def test_unexpected_errors_keep_their_traceback(monkeypatch, picture):
-    monkeypatch.setattr(detector.Detector, "detect", failing(RuntimeError("a bug")))
-    with pytest.raises(RuntimeError, match="a bug"):
-        run("detect", picture)
 
 
 def test_batch_refuses_bad_input(material, tmp_path, monkeypatch):

@@ -13,7 +13,6 @@ from vehicle_detection import detector
 from vehicle_detection.boxes import Detections
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.scenes import SceneVehicle, render_scene
-from vehicle_detection.svm import load_classifier
 from vehicle_detection.video import read_frames
 
 
@@ -50,18 +49,6 @@ def test_detect_writes_annotated_images_and_boxes(monkeypatch, picture, tmp_path
     assert changed[50:120, 100].all()
     assert not changed[130:].any()
     assert changed[:20, 10:60].any()  # the score
-
-
-def test_detect_draws_scores_and_lines_as_asked(monkeypatch, picture, tmp_path):
-    found = Detections([[100, 60, 180, 120]], [1.5])
-    monkeypatch.setattr(detector.Detector, "detect", lambda self, image: found)
-    image, changed = read_image(picture), {}
-    for name, words in {"plain": [], "bare": ["--labels", "none"], "wide": ["--line-width", 5]}.items():
-        succeed("detect", picture, "-o", tmp_path / name, *words)
-        changed[name] = (read_image(tmp_path / name / "road.png") != image).any(axis=2)
-    assert changed["plain"][:60].any()
-    assert not changed["bare"][:60].any()
-    assert changed["wide"][90, 100:140].sum() == 5
 
 
 def test_detect_keeps_boxes_of_a_minimum_confidence(tmp_path):
@@ -105,12 +92,6 @@ def test_patterns_of_images_are_expanded_and_each_image_searched_once(picture, t
     ]
     # A name with brackets is no pattern, so that a wrong one is refused.
     assert "[a].png does not exist; check the path" in refuse("detect", tmp_path / "[a].png")
-
-
-def test_detect_adds_a_suffix_to_an_image_without_one(picture, tmp_path):
-    shutil.copy(picture, tmp_path / "frame7")
-    succeed("detect", tmp_path / "frame7", "-o", tmp_path / "out")
-    assert contents(tmp_path / "out") == ["frame7.png"]
 
 
 def test_a_damaged_but_readable_image_gives_a_warning(picture, tmp_path):
@@ -248,15 +229,3 @@ def test_the_course_images_by_command(real_data, tmp_path):
     succeed("detect", *images, "--boxes", tmp_path / "boxes.csv")
     labels = real_data / "labels" / "test_images.csv"
     assert "9 found, 0 missed, 0 false" in succeed("evaluate", tmp_path / "boxes.csv", labels)
-
-
-def test_damaged_models_are_refused(picture, tmp_path):
-    path = tmp_path / "edited.safetensors"
-    load_classifier().save(path)
-    assert succeed("info", path).startswith(f"{path}: ")
-    data = bytearray(path.read_bytes())
-    data[-5] ^= 255
-    path.write_bytes(data)
-    for words in (["detect", picture], ["video", tmp_path / "x.mp4", "-o", tmp_path / "y.mp4"]):
-        assert "was changed after it was written" in refuse(*words, "--model", path)
-    assert "was changed after it was written" in refuse("info", path)

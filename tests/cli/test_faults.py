@@ -27,16 +27,12 @@ from tests.cli.commands import (
 )
 from tests.helpers import ROOT
 from tests.video.clips import gray_frames, write_clip
-from vehicle_detection import detector, tables
-from vehicle_detection._common import files
+from vehicle_detection import detector
 from vehicle_detection._kernels.jit import jit
 from vehicle_detection.cli.signals import raise_on_signals
 from vehicle_detection.drive import events
-from vehicle_detection.errors import OutputError
-from vehicle_detection.formats import write
 from vehicle_detection.images import write_image
 from vehicle_detection.scenes import render_scene
-from vehicle_detection.video import probe_video
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
 
@@ -245,60 +241,6 @@ def test_an_interrupt_while_clips_are_cut_keeps_all_other_files(clip, tmp_path, 
     assert contents(tmp_path) == sorted(["clips", "clips/0000.2s_cut_in_1.mp4", *outputs.values()])
 
 
-def test_a_disk_that_is_full_while_tracks_are_written(clip, tmp_path, monkeypatch):
-    def fill(self, result):
-        raise FULL
-
-    monkeypatch.setattr(write.TrackStream, "__call__", fill)
-    words = ["-o", tmp_path / "out.mp4", "--tracks", tmp_path / "out.csv", "--model", "highway"]
-    message = refuse("video", clip, *words, "-q")
-    assert message.endswith("out.csv cannot be written (No space left on device); free some space\n")
-    assert contents(tmp_path) == []
-
-
-def test_a_target_that_becomes_a_folder_while_the_video_is_made(clip, tmp_path, monkeypatch):
-    append = tables.TrackTable.append
-
-    def replace(self, *args):
-        (tmp_path / "out.csv").mkdir(exist_ok=True)
-        append(self, *args)
-
-    monkeypatch.setattr(tables.TrackTable, "append", replace)
-    words = ["-o", tmp_path / "out.mp4", "--tracks", tmp_path / "out.csv", "--report", tmp_path / "out.html"]
-    message = refuse("video", clip, *words, "--model", "highway", "-q")
-    assert re.search(r"out.csv cannot be written \(.*\); check the folder, .*out.mp4 is complete", message)
-    assert contents(tmp_path) == ["out.csv", "out.mp4"]
-
-
-def test_a_demo_folder_that_is_read_only(tmp_path, monkeypatch):
-    error = OSError(errno.EROFS, "Read-only file system", str(tmp_path / ".demo.x"))
-    monkeypatch.setattr(files.tempfile, "mkdtemp", failing(error))
-    message = refuse("demo", "-o", tmp_path)
-    assert "cannot be written (Read-only file system); check the folder, or choose another" in message
-
-
-def test_a_demo_without_ffmpeg(tmp_path):
-    code = """
-import sys, imageio_ffmpeg
-def fail():
-    raise RuntimeError("No ffmpeg exe could be found.")
-imageio_ffmpeg.get_ffmpeg_exe = fail
-"""
-    code, _, errors = finish(start_changed(code, "demo", "-o", tmp_path, "--frames", 3))
-    assert code == 2
-    assert errors.startswith("error: no ffmpeg program was found; install ffmpeg, or set")
-    assert contents(tmp_path) == []
-
-
-def test_a_demo_names_its_folder_in_errors(tmp_path, monkeypatch):
-    def fail(clip, annotated, *_, **__):
-        raise OutputError(f"{annotated} cannot be written")
-
-    monkeypatch.setattr("vehicle_detection.process_video", fail)
-    message = refuse("demo", "-o", tmp_path, "--frames", 3)
-    assert message == f"error: {tmp_path / 'annotated.mp4'} cannot be written\n"
-
-
 def test_an_interrupted_batch_leaves_no_empty_folder(clip, tmp_path):
     code = """
 import sys, time
@@ -327,15 +269,6 @@ def test_a_current_folder_that_has_been_removed(clip, tmp_path):
 
 
 # --- arguments and environment ---
-
-
-def test_loops_of_links(clip, tmp_path):
-    loop = tmp_path / "loop.mp4"
-    loop.symlink_to(loop)
-    assert "loop.mp4 does not exist; check the path" in refuse("video", loop, "-o", tmp_path / "out.mp4")
-    # As a target it is replaced.
-    assert run("video", clip, "-o", loop, "--model", "highway", "-q").exit_code == 0
-    assert probe_video(loop).frames == 10
 
 
 @pytest.mark.parametrize(

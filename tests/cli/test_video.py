@@ -19,7 +19,6 @@ from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.cli.options import parse_time
 from vehicle_detection.cli.video_outputs import read_speed
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.images import write_image
 from vehicle_detection.scenes import render_drive
 from vehicle_detection.tracking import HorizonEstimate
 from vehicle_detection.video import FrameSource, probe_video, read_frames
@@ -71,17 +70,6 @@ def test_video_warns_of_a_wrong_horizon(clip, tmp_path, monkeypatch):
     camera.write_text('{"fov": 58, "horizon": 0.95}')
     result = run(*words, "--camera", camera)
     assert f"warning: no vehicle was found with the horizon of --camera {camera}, but" in result.stderr
-
-
-def test_images_have_a_frame_rate_also_when_the_horizon_is_checked(tmp_path):
-    (tmp_path / "images").mkdir()
-    for number in range(4):
-        write_image(tmp_path / "images" / f"{number}.png", np.full((180, 320, 3), 90, np.uint8))
-    words = ["--fps", 1, "--start", 2, "--horizon", 0.95, "-o", tmp_path / "out.mp4"]
-    result = run("video", tmp_path / "images", *words, "--model", "highway")
-    assert result.exit_code == 0
-    assert "a search of all rows found too few vehicles" in result.stderr
-    assert probe_video(tmp_path / "out.mp4").duration == pytest.approx(2.0)
 
 
 def test_video_writes_an_annotated_copy_and_tracks(clip, tmp_path):

@@ -1,7 +1,6 @@
 """Annotated frames: tracks with labels, the bird's-eye view, blurred vehicles, diagnostics."""
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ from vehicle_detection.annotator import (
 )
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
-from vehicle_detection.drawing import TRACK_COLORS, blur_boxes, draw_text, text_size
+from vehicle_detection.drawing import TRACK_COLORS, blur_boxes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes import SceneVehicle, render_scene
 from vehicle_detection.tracking import FrameResult
@@ -52,19 +51,6 @@ class TestTracks:
         assert [track_color(track(id=1 + k)) for k in range(count)] == list(TRACK_COLORS)
         assert track_color(track(id=1 + count)) == TRACK_COLORS[0]
         assert track_color(track(id=0, state="tentative")) not in TRACK_COLORS
-
-    def test_color_blind_viewers_can_tell_the_colors_apart(self):
-        """Machado et al. (2009), full protanopia, deuteranopia and tritanopia."""
-        simulations = np.array([
-            0.152286, 1.052583, -0.204868, 0.114503, 0.786281, 0.099216, -0.003882, -0.048116, 1.051998,
-            0.367322, 0.860646, -0.227968, 0.280085, 0.672501, 0.047413, -0.011820, 0.042940, 0.968881,
-            1.255528, -0.076749, -0.178779, -0.078411, 0.930809, 0.147602, 0.004733, 0.691367, 0.303900,
-        ])  # fmt: skip
-        linear = (np.array(TRACK_COLORS) / 255) ** 2.2
-        for matrix in simulations.reshape(3, 3, 3):
-            simulated = np.clip(linear @ matrix.T, 0, 1) ** (1 / 2.2) * 255
-            nearest = min(np.linalg.norm(a - b) for a, b in itertools.combinations(simulated, 2))
-            assert nearest > 25
 
     def test_tracks_that_are_not_shown_are_not_drawn(self):
         drawn = draw_tracks(blank(), [track(shown=False), track(id=0, state="tentative", shown=False)])
@@ -122,16 +108,6 @@ class TestTracks:
         assert changed.sum() > 0.9 * sum(labels_of([one]).sum() for one in pair)
         assert not changed[402:490, 610:700].any()
 
-    def test_the_line_width_is_given_or_grows_with_the_image(self):
-        def width_of(image, **options):
-            drawn = draw_tracks(image, [track((200, 100, 400, 300))], labels=(), **options)
-            return int((drawn[200, 200:300] != 90).any(axis=1).sum())
-
-        assert [width_of(blank(), line_width=width) for width in (1, 5)] == [1, 5]
-        widths = [width_of(blank(*shape)) for shape in SIZES]
-        assert widths == sorted(widths)
-        assert widths[0] == 2
-
     def test_colors_by_distance_run_from_near_to_far(self):
         near, middle, between, far, unknown = (
             track_color(track(distance_m=distance), "distance") for distance in (3.0, 20.0, 27.0, 80.0, None)
@@ -141,13 +117,6 @@ class TestTracks:
         assert unknown not in TRACK_COLORS
         drawn = draw_tracks(blank(), [track(distance_m=3.0)], color_by="distance")
         assert tuple(drawn[489, 650].tolist()) == TRACK_COLORS[5]
-
-    def test_near_vehicles_are_drawn_over_far_ones(self):
-        near, far = track((600, 400, 700, 500)), track((650, 380, 750, 470), id=2)
-        for order in ([near, far], [far, near]):
-            drawn = draw_tracks(blank(), order, labels=())
-            assert tuple(drawn[401, 670].tolist()) == TRACK_COLORS[0]
-            assert tuple(drawn[450, 698].tolist()) == TRACK_COLORS[0]
 
     @settings(max_examples=40)
     @given(
@@ -186,16 +155,6 @@ class TestText:
         assert track_text(track(), ("speed",), own_mps=25.0) == "84 km/h"
         assert track_text(track(speed_mps=-45.0), ("speed", "std"), "imperial", 25.0) == "45 ± 1 mph"
 
-    def test_the_font_has_a_plus_minus_sign(self):
-        drawn = []
-        for text in ("+", "±"):
-            image = blank(40, 60)
-            draw_text(image, [text], 5, 5, 1.0, (255, 255, 255))
-            drawn.append((image != 90).any(axis=2))
-        assert drawn[1][drawn[0]].all()
-        assert drawn[1].sum() > drawn[0].sum()
-        assert text_size(["±"], 1.0) == text_size(["+"], 1.0)
-
 
 class TestDrawer:
     """What is remembered from frame to frame."""
@@ -206,13 +165,6 @@ class TestDrawer:
             drawer.draw_tracks(blank(), [track((580, 400, 680, 490), distance_m=30.0)], time=0.0)
             first, again = (drawer.draw_tracks(blank(), [track()], time=0.04) for _ in range(2))
             np.testing.assert_array_equal(first, again)
-
-    def test_an_earlier_frame_starts_anew(self):
-        drawer = Annotator(DrawParams(panel="corner"))
-        first = drawer.draw_tracks(blank(), [track()], time=1.0)
-        for time in (1.1, 1.3, 1.6):
-            drawer.draw_tracks(blank(), [track(distance_m=23.6 + 10 * time)], time=time)
-        np.testing.assert_array_equal(drawer.draw_tracks(blank(), [track()], time=1.0), first)
 
     def test_frames_between_two_searches_are_dashed_like_the_last_searched_one(self):
         """A predicted box of a vehicle that the last search has found is not dashed."""
@@ -251,17 +203,6 @@ class TestPosition:
         assert road_position(known, CAMERA, SHAPE).lateral_m == pytest.approx(
             sign * (0.150 * 8.5 + CAMERA.vehicle_width_m / 2)
         )
-
-    def test_a_whole_box_of_a_fisheye_lens_is_not_truncated(self):
-        camera = Camera.for_frame(SHAPE, lens="fisheye-120")
-        camera = dataclasses.replace(camera, vehicle_length_m=9.0)
-        known = track((761, 380, 1147, 600), distance_m=4.0, distance_std_m=0.5)
-        assert road_position(known, camera, SHAPE).lateral_m == pytest.approx(3.5, abs=0.1)
-
-    def test_the_error_is_larger_along_the_ray(self):
-        position = road_position(track((600, 400, 680, 460), distance_std_m=2.0), CAMERA, SHAPE)
-        assert position.radial_std_m == pytest.approx(2.0)
-        assert 0.05 < position.tangential_std_m < 0.3
 
 
 class TestPanel:
@@ -309,36 +250,6 @@ class TestPanel:
         rows = (drawn[:, -4:] == drawn[lines[0], -4:]).all(axis=(1, 2))
         assert np.flatnonzero(rows).tolist() == sorted(lines)
 
-    def test_labels_stay_outside_the_corner(self):
-        _, width = BirdsEyePanel.corner_size(SHAPE)
-        left = 1280 - width
-        near_corner = track((left - 40, 320, left + 60, 400))
-        drawn, empty = (
-            Annotator(DrawParams(panel="corner"), camera=CAMERA).draw_tracks(blank(), tracks)
-            for tracks in ([near_corner], [])
-        )
-        changed = (drawn != empty).any(axis=2)
-        color = (drawn[:300, left:] == TRACK_COLORS[0]).all(axis=2) & changed[:300, left:]
-        assert color.sum() < 400  # the vehicle in the view, no label
-
-    def test_numbers_stay_in_the_view(self):
-        """At each border; a small view has no room for numbers."""
-        options = {"distance_std_m": 0.1, "speed_mps": None}
-        boxes = {79.0: (600, 400, 680, 470), 20.0: (1000, 400, 1080, 470), 21.0: (200, 400, 280, 470)}
-        for distance, box in boxes.items():
-            tracks = [track(box, id=8, distance_m=distance, **options)]
-            drawn = Annotator(SIDE, camera=CAMERA).draw_tracks(blank(), tracks)
-            empty = Annotator(SIDE, camera=CAMERA).draw_tracks(blank(), [])
-            white = ((drawn == 235).all(axis=2) & (empty != 235).any(axis=2))[:, 1280:]
-            rows, columns = np.nonzero(white)
-            assert np.ptp(rows) >= 8
-            assert np.ptp(columns) >= 4
-        image = blank(240, 320)
-        small = [
-            Annotator(DrawParams(panel="corner", labels=())).draw_tracks(image, each) for each in (tracks, [])
-        ]
-        assert ((small[0] == 235).all(axis=2) & (small[1] != 235).any(axis=2)).sum() == 0
-
     def test_a_vehicle_is_at_its_place(self):
         """A vehicle in the own lane: in the middle, and the farther the higher."""
         rows = []
@@ -350,20 +261,6 @@ class TestPanel:
             rows.append(y.max())
         scale = 720 / 86
         np.testing.assert_allclose(np.diff(rows), [-20 * scale, -30 * scale], atol=2)
-
-    def test_unknown_and_far_vehicles_are_left_out(self):
-        empty = Annotator(DrawParams(panel="corner"), camera=CAMERA).draw_tracks(blank(), [])
-        for known in (track(distance_m=None, distance_std_m=None), track(distance_m=90.0)):
-            drawn = Annotator(DrawParams(panel="corner"), camera=CAMERA).draw_tracks(blank(), [known])
-            np.testing.assert_array_equal(drawn[:300, 1150:], empty[:300, 1150:])
-
-    def test_a_coasting_vehicle_is_hollow(self):
-        sums = []
-        for state in ("confirmed", "coasting"):
-            ahead = track((600, 400, 680, 470), distance_std_m=0.1, speed_mps=None, state=state)
-            drawn = Annotator(SIDE, camera=CAMERA).draw_tracks(blank(), [ahead])
-            sums.append((drawn[:, 1280:] == TRACK_COLORS[0]).all(axis=2).sum())
-        assert sums[1] < 0.6 * sums[0]
 
 
 @pytest.mark.parametrize(
@@ -399,12 +296,6 @@ class TestDiagnostics:
         assert inside[2][20, 20].sum() > 500
         assert panels[2][300, 500].sum() < 20
         assert (inside[3][-1, 25] == TRACK_COLORS[0]).all()
-
-    def test_frames_need_not_be_in_c_order(self):
-        image, heat = np.random.default_rng(0).integers(0, 256, (60, 90, 3), np.uint8), np.zeros((60, 90))
-        expected = draw_diagnostics(image, [[5, 5, 30, 30]], heat, [])
-        for frame in (np.asfortranarray(image), image[:, ::-1][:, ::-1]):
-            np.testing.assert_array_equal(draw_diagnostics(frame, [[5, 5, 30, 30]], heat, []), expected)
 
 
 HEAT = np.zeros((720, 1280))

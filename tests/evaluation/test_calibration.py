@@ -38,14 +38,6 @@ def test_the_sigmoid_equals_that_of_scikit_learn():
     np.testing.assert_allclose(ours, theirs.predict_proba(scores[:, None])[:, 1], atol=1e-3)
 
 
-def test_the_prior_bounds_probabilities_of_separable_scores():
-    platt = calibrate_scores([-1.0, -1.0, 1.0, 1.0], [0, 0, 1, 1])
-    # Platt's prior: two of two is 3/4.
-    assert platt.probability([-1.0, 1.0]) == pytest.approx([0.25, 0.75], abs=1e-4)
-    level = calibrate_scores([0.3, 0.3], [0, 1])
-    assert level.probability(0.3) == pytest.approx(0.5, abs=1e-6)
-
-
 def test_without_the_prior_the_sigmoid_is_plain_logistic_regression():
     from sklearn.linear_model import LogisticRegression
 
@@ -78,12 +70,6 @@ def test_probabilities_increase_with_the_score(scores, a, b):
     probabilities = platt.probability(sorted(scores))
     assert ((probabilities >= 0) & (probabilities <= 1)).all()
     assert (np.diff(probabilities) >= 0).all()
-
-
-@given(probability=st.floats(0.001, 0.999), a=st.floats(-10, -0.1), b=st.floats(-5, 5))
-def test_score_is_the_inverse_of_probability(probability, a, b):
-    platt = Platt(a, b)
-    assert platt.probability(platt.score(probability)) == pytest.approx(probability)
 
 
 def test_invalid_arguments_of_calibrate_scores():
@@ -151,13 +137,3 @@ def test_calibration_error_lies_between_0_and_1(pairs, bins):
 def test_invalid_arguments_of_calibration_error(probabilities, labels, bins, message):
     with pytest.raises(InvalidInputError, match=message):
         calibration_error(probabilities, labels, bins=bins)
-
-
-@pytest.mark.parametrize("prior", [True, False])
-@pytest.mark.parametrize(("factor", "shift"), [(1.0, 1e4), (1e-4, 0.0), (1e3, -50.0)])
-def test_the_unit_of_the_scores_does_not_matter(prior, factor, shift):
-    scores, truth = drawn_scores(-1.5, 0.3, count=300)
-    expected = calibrate_scores(scores, truth, prior=prior).probability(scores)
-    moved = scores * factor + shift
-    found = calibrate_scores(moved, truth, prior=prior).probability(moved)
-    np.testing.assert_allclose(found, expected, atol=1e-3)

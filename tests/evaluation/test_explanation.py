@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.helpers import random_classifier
 from tests.network.graphs import constant_network, spot_network
 from vehicle_detection import (
     FeatureParams,
@@ -113,16 +112,6 @@ def test_shares_of_a_patch_are_exact(params):
     assert cells.sum() == pytest.approx(shares.sum() - shares[histogram].sum())
 
 
-def test_a_share_lies_where_its_feature_does():
-    params = FeatureParams(hist_feat=False, spatial_size=16)
-    shares = np.zeros(params.length)
-    params.spatial_planes(shares[: params.spatial_length])[1, 2, 15] = 3.0
-    hog = shares[params.spatial_length :].reshape(3, 7, 7, 2, 2, 9)
-    hog[2, 4, 5, 1, 0, 6] = 5.0
-    cells = patch_cell_shares(shares, params)
-    assert {tuple(cell): cells[tuple(cell)] for cell in np.argwhere(cells)} == {(1, 7): 3.0, (5, 5): 5.0}
-
-
 def test_terms_of_a_classifier_are_its_score():
     with VehicleDetector("highway") as detector:
         explanation = explain(detector, SCENE.image, SCENE.boxes[0])
@@ -134,15 +123,6 @@ def test_terms_of_a_classifier_are_its_score():
         assert list(explanation.terms) == ["cells", "bias", "color histogram"]
         nothing = explain(detector, SCENE.image, [0, 0, 60, 60])
         assert (nothing.found, nothing.score) == (False, None)
-
-
-def test_the_best_template_of_a_classifier_is_explained():
-    classifier = random_classifier(FeatureParams(), templates=3)
-    with VehicleDetector(classifier) as detector:
-        explanation = explain(detector, SCENE.image, [200, 100, 264, 164])
-    x1, y1, x2, y2 = np.rint(explanation.window).astype(int)
-    patch = cv2.resize(SCENE.image[y1:y2, x1:x2], (64, 64))
-    assert explanation.margin == pytest.approx(classifier.decision_function(patch[None])[0])
 
 
 @pytest.mark.parametrize(("seconds", "frame"), [((0.0, 0.04), 0), ((0.04, 0.08), 1)])

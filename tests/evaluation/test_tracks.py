@@ -190,12 +190,6 @@ def test_hota_by_hand():
     assert math.isnan(evaluate_tracks(TrackTable([], [], []), TrackTable([], [], [])).hota)
 
 
-def test_hota_leaves_ignored_boxes_out():
-    labels = boxes_of((0, 1, CAR), (0, -1, (700, 0, 900, 90)), ignore=[False, True])
-    found = boxes_of((0, 5, CAR), (0, 6, moved(740)))
-    assert evaluate_tracks(found, labels).hota == 1
-
-
 def test_tracks_with_ignored_boxes_as_regions():
     labels = boxes_of((0, 1, moved(500)), (0, 2, (0, 0, 300, 90)), ignore=np.array([False, True]))
     found = boxes_of((0, 7, CAR), (0, 8, moved(500)))

@@ -137,12 +137,6 @@ def test_a_network_whose_names_are_no_vehicles_needs_classes(tmp_path):
     assert len(find(load(tmp_path, network, classes=["Hund", "Katze", "Maus"])).vehicles) == 2
 
 
-def test_the_class_of_a_box_is_the_most_probable_one(tmp_path):
-    rows = dense(CELLS)
-    rows[0, 3, 4 + 3] = 0.85  # rather a motorcycle than a car
-    assert not len(find(load(tmp_path, constant_network({"output0": rows.transpose(0, 2, 1)}))).vehicles)
-
-
 def test_the_size_of_the_image_as_a_second_input(tmp_path):
     outputs = dict(KINDS["labels, boxes, scores"][0])
     outputs["boxes"] = outputs["boxes"] / 96

@@ -1,8 +1,4 @@
-import copy
 import dataclasses
-import multiprocessing
-import pickle
-import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -11,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
-from tests.network.graphs import PARAMS, constant_network, echo_network, own_network, serialize
+from tests.network.graphs import PARAMS, echo_network, own_network, serialize
 from tests.network.test_runtime import NO_OPENVINO, RUNTIMES
 from vehicle_detection.boxes import iou_matrix, logit
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.heatmap import HeatParams, heat_range
-from vehicle_detection.network import METADATA_KEY, NetworkParams, load_network
+from vehicle_detection.heatmap import HeatParams
+from vehicle_detection.network import NetworkParams, load_network
 from vehicle_detection.network.model import to_log_odds, to_probability
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (360, 640, 3), dtype=np.uint8)
@@ -118,40 +114,6 @@ def test_threads(file, runtime):
 SEARCH = None
 
 
-def search_in_child(_):
-    return SEARCH.find(IMAGE).vehicles.boxes
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="fork is safe on Linux only")
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-@pytest.mark.parametrize("runtime", RUNTIMES)
-def test_a_forked_process(file, runtime):
-    global SEARCH
-    with load_network(file, runtime=runtime).open_search(jobs=2) as SEARCH:
-        expected = SEARCH.find(IMAGE).vehicles.boxes
-        with multiprocessing.get_context("fork").Pool(1) as pool:
-            (boxes,) = pool.map_async(search_in_child, [0]).get(timeout=60)
-            np.testing.assert_array_equal(boxes, expected)
-        np.testing.assert_array_equal(SEARCH.find(IMAGE).vehicles.boxes, expected)
-
-
-def test_copies(model, tmp_path):
-    for other in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
-        check_equal(find(model), find(other))
-    model.save(tmp_path / "copy.onnx")
-    check_equal(find(model), find(load_network(tmp_path / "copy.onnx")))
-
-
-@pytest.mark.parametrize(
-    "shape",
-    [(1, 1), (1, 700), (700, 1), (20, 30), (31, 300), (1, 20_000), (33, 20_000), (360, 480), (640, 360)],
-)
-@pytest.mark.parametrize("runtime", RUNTIMES)
-def test_frames_of_any_size(file, shape, runtime):
-    image = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
-    check_inside(find(load_network(file, runtime=runtime), image, score=-9.0), shape)
-
-
 @given(st.integers(1, 400), st.integers(1, 400), st.integers(1, 10))
 def test_boxes_are_inside_the_frame(model, height, width, steps):
     image = np.random.default_rng(height).integers(0, 256, (height, width, 3), dtype=np.uint8)
@@ -207,15 +169,6 @@ def test_a_file_that_does_not_fit_itself(tmp_path, change, message):
     assert "own.onnx" in str(raised.value)
 
 
-def test_metadata_of_another_kind(tmp_path):
-    file = tmp_path / "own.onnx"
-    outputs = {"boxes": np.zeros((1, 5, 84), np.float32)}
-    for text in ("{", "[]", '{"format_version": 1, "params": {}, "metadata": {}}'):
-        file.write_bytes(constant_network(outputs, metadata={METADATA_KEY: text}))
-        with pytest.raises(ModelFileError, match="does not fit its own parameters"):
-            load_network(file)
-
-
 @pytest.mark.parametrize("runtime", RUNTIMES)
 def test_invalid_weights(tmp_path, runtime):
     file = tmp_path / "own.onnx"
@@ -250,14 +203,6 @@ def test_input_layouts(tmp_path, dtype, layout, runtime):
     np.testing.assert_allclose(found.vehicles.boxes, [corners], atol=0.02)
 
 
-def test_a_network_for_another_task(tmp_path):
-    file = tmp_path / "other.onnx"
-    outputs = {"output0": np.zeros((1, 84, 84), np.float32)}
-    file.write_bytes(constant_network(outputs, metadata={"task": "segment"}))
-    with pytest.raises(ModelFileError, match="'segment'; export one for detection"):
-        load_network(file)
-
-
 @pytest.mark.parametrize(
     "inputs",
     [
@@ -277,11 +222,3 @@ def test_other_inputs(tmp_path, inputs):
     file.write_bytes(serialize([node], inputs, [output], [("values", values)]))
     with pytest.raises(ModelFileError, match=r"other\.onnx must have one input, float32, float16 or uint8"):
         load_network(file)
-
-
-def test_params():
-    assert NetworkParams.default() == NetworkParams()
-    assert heat_range(NetworkParams(), HeatParams()).default == 0
-    for wrong in ({"input_size": 100}, {"input_size": 16}, {"input_size": 64.0}, {"min_score": "a"}):
-        with pytest.raises(InvalidInputError, match=next(iter(wrong))):
-            NetworkParams(**wrong)

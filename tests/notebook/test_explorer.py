@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from vehicle_detection.boxes import Detections, iou_matrix
+from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.camera import Camera
 from vehicle_detection.datasets import load_frames
-from vehicle_detection.detector import VehicleDetector, load_model
+from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import HeatParams, frame_heat
 from vehicle_detection.images import write_image
@@ -119,14 +119,6 @@ def test_the_given_parameters_are_used(scenes):
     assert (grouped.method, grouped.group_params.min_peak) == ("groups", 1.0)
 
 
-def test_the_model_is_a_name_a_path_or_a_model(scenes, tmp_path):
-    model = load_model("default")
-    model.save(tmp_path / "model.onnx")
-    expected = Explorer(scenes).boxes().boxes
-    for same in (model, tmp_path / "model.onnx"):
-        np.testing.assert_array_equal(Explorer(scenes, same).boxes().boxes, expected)
-
-
 def test_the_horizon_of_a_network_is_that_of_the_camera(scenes):
     explorer = Explorer(scenes)
     assert explorer.bands == ()
@@ -189,28 +181,6 @@ def test_only_a_new_frame_or_horizon_needs_a_search(explorer, count_searches):
     assert len(searches) == 3 * bands
 
 
-def test_a_higher_threshold_of_a_network_needs_no_search(scenes, count_searches):
-    explorer = Explorer(scenes)
-    searches = count_searches(explorer)
-    counts = []
-    for score in (0.0, 3.0, 6.0):
-        explorer.set_search(min_score=score)
-        explorer.render()
-        counts.append(len(explorer.windows()))
-    assert len(searches) == 1
-    assert counts[0] > counts[1] > counts[2]
-
-
-def test_parameters_may_be_assigned(explorer):
-    before = len(explorer.windows())
-    bands = explorer.search_params.bands
-    explorer.search_params = SearchParams(bands=bands, horizon=0.56, min_score=1.5, horizontal_padding=0.5)
-    fewer = len(explorer.windows())
-    assert fewer < before
-    explorer.search_params = SearchParams(bands=bands[1:], horizon=0.56, min_score=1.5)
-    assert len(explorer.windows()) < fewer
-
-
 # Images
 
 
@@ -233,27 +203,6 @@ def test_each_view_shows_another_image(explorer, scenes):
     np.testing.assert_array_equal(scenes[0], render_scene(shape=SHAPE, vehicles=3, random_state=1).image)
 
 
-def test_boxes_have_their_numbers(explorer, monkeypatch):
-    given = []
-    monkeypatch.setattr(module, "draw_texts", lambda image, boxes, texts, *look: given.append((boxes, texts)))
-    explorer.render()
-    ((boxes, texts),) = given
-    best_first = np.argsort(-explorer.boxes().scores, kind="stable")
-    np.testing.assert_array_equal(boxes, explorer.boxes().boxes[best_first])
-    assert texts == [str(number + 1) for number in range(len(best_first))]
-
-
-def test_wide_frames_are_reduced(scenes):
-    large = cv2.resize(scenes[0], (1280, 720))
-    explorer = explore([large], width=320)
-    for view in VIEWS:
-        explorer.set_view(view)
-        assert explorer.render().shape == (180, 320, 3)
-    x1, y1, x2, _ = (explorer.boxes().boxes[0] / 4).round().astype(int)
-    explorer.set_view("boxes")
-    assert (explorer.render()[y1, x1 + 3 : x2 - 3] == module._BOX_COLOR).all()
-
-
 def test_the_summary_counts_windows_and_boxes(explorer, scenes):
     hits, found = len(explorer.windows()), len(explorer.boxes())
     total = len(explorer._find().windows)
@@ -263,14 +212,6 @@ def test_the_summary_counts_windows_and_boxes(explorer, scenes):
     network = Explorer(scenes)
     hits, found = len(network.windows()), len(network.boxes())
     assert network.summary() == f"frame 0, 640x360: {hits:,} windows above 0, {found} boxes"
-
-
-def test_a_horizon_at_the_border_of_the_frame(explorer):
-    explorer.set_search(horizon=1.0)
-    with pytest.raises(InvalidInputError, match="search window below the horizon at 1"):
-        explorer.render()
-    explorer.set_search(horizon=0.0)
-    assert explorer.render().shape == (*SHAPE, 3)
 
 
 # Frames
@@ -469,33 +410,8 @@ def test_a_click_explains_the_box(scenes, monkeypatch):
     assert (explorer.box, explorer.explanation()) == (0, None)
 
 
-def test_values_outside_the_usual_range_widen_the_slider(scenes):
-    search = SearchParams(bands=SearchParams.preset().bands, min_score=-7.0)
-    controls, *_ = open_panel(explore(scenes, search_params=search, region_params=HeatParams(threshold=39.0)))
-    assert (controls["min. score"].value, controls["min. score"].min) == (-7.0, -7.0)
-    assert (controls["min. heat"].value, controls["min. heat"].max) == (39.0, 39.0)
-
-
 def test_only_the_sliders_need_ipywidgets(explorer, monkeypatch):
     monkeypatch.setitem(sys.modules, "ipywidgets", None)
     assert explorer.render().shape == (*SHAPE, 3)
     with pytest.raises(InvalidInputError, match="pip install ipywidgets"):
         explorer.widget()
-
-
-def test_a_notebook_displays_the_widgets(explorer, monkeypatch):
-    import IPython.display
-
-    shown = []
-    monkeypatch.setattr(IPython.display, "display", shown.append)
-    explorer._ipython_display_()
-    assert [type(widget).__name__ for widget in shown] == ["HBox"]
-
-
-@pytest.mark.realdata
-def test_real_images(real_data):
-    explorer = explore(load_frames(real_data / "test_images"))
-    explorer.set_frame("test1.jpg")
-    assert isinstance(explorer.boxes(), Detections)
-    assert len(explorer.boxes()) >= 2
-    assert explorer.render().shape == (540, 960, 3)

@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 
 from tests.helpers import random_classifier, rendered_patches
-from tests.notebook.helpers import SMALL, legend, new_axes, texts, titles
+from tests.notebook.helpers import SMALL, legend, texts, titles
 from vehicle_detection import notebook
 from vehicle_detection.features import FeatureParams, extract_features, hog_image
-from vehicle_detection.notebook.features import add_glyphs
 from vehicle_detection.notebook.style import OTHER, VEHICLE
 from vehicle_detection.svm import Template, VehicleClassifier
 
@@ -83,12 +82,6 @@ def test_a_glyph_is_parallel_to_the_edge(ahead, slope):
         assert np.sign(np.corrcoef(x, y)[0, 1]) == np.sign(along[0] * along[1])
 
 
-def test_glyphs_of_zeros_are_empty():
-    axes = new_axes()
-    assert not len(add_glyphs(axes, np.zeros((2, 3, 9))).get_segments())
-    assert (axes.get_xlim(), axes.get_ylim()) == ((0, 3), (2, 0))
-
-
 def test_vectors_are_plotted_before_and_after_scaling(patch_set):
     classifier = random_classifier(SMALL)
     figure = notebook.plot_features(patch_set, classifier, rows=[3, 30], names=["car", "road"])
@@ -108,19 +101,6 @@ def test_vectors_are_plotted_before_and_after_scaling(patch_set):
     parts = ["spatial bins (192)", "color histogram (24)", "HOG (648)"]
     assert texts(above.texts) == parts
     assert below.get_ylabel() == "value (standard deviations)"
-
-
-def test_without_a_classifier_the_scaler_is_fitted_to_the_patches(patch_set):
-    rows = range(len(patch_set))
-    figure = notebook.plot_features(patch_set, SMALL, rows=rows)
-    scaled = np.array([line.get_ydata() for line in figure.axes[1].lines])
-    np.testing.assert_allclose(scaled.mean(axis=0), 0, atol=1e-6)
-    deviation = scaled.std(axis=0)
-    assert np.allclose(deviation[deviation > 0], 1)
-    assert figure.axes[0].get_legend() is None
-    # only used parts are shaded
-    params = FeatureParams(spatial_feat=False, hist_feat=False)
-    assert len(notebook.plot_features(patch_set, params).axes[0].texts) == 1
 
 
 def classifier_with_mean(params):

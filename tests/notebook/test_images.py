@@ -87,16 +87,6 @@ def test_patches_of_a_set_show_class_and_source(patch_set):
     assert top[4] > bottom[0]
 
 
-def test_patches_from_a_list_have_no_edges_without_labels(patch_set):
-    axes = notebook.plot_patches(list(patch_set.patches[:3]), captions=["a", "", "c"], ax=new_axes())
-    assert texts(axes.texts) == ["a", "c"]
-    assert not axes.collections
-    assert axes.get_legend() is None
-    labelled = notebook.plot_patches(patch_set.patches[:3], labels=[1, 0, 1], ax=new_axes())
-    assert len(labelled.collections) == 3
-    assert legend(labelled) == ["vehicle", "other"]
-
-
 def test_the_balance_counts_the_patches_of_each_source(patch_set):
     some = patch_set[:30]
     axes = notebook.plot_balance(some, ax=new_axes())

@@ -1,10 +1,8 @@
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from tests.notebook.helpers import drawn_boxes, gray_image, legend, new_axes, texts
+from tests.notebook.helpers import gray_image, legend, new_axes, texts
 from vehicle_detection import notebook
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.evaluation import LabelledFrames, evaluate_detections, precision_recall_curve
@@ -53,18 +51,6 @@ def test_false_positives_are_shown_by_descending_score():
     assert sum(color == pytest.approx(VERMILION) for color in colors) == 2
     one = notebook.plot_errors(frames, found, kind="false", count=1, ax=new_axes())
     assert len(one.images) == 1
-
-
-def test_boxes_have_the_same_position_in_the_crop_as_in_the_frame():
-    frames, found = labelled()
-    axes = notebook.plot_errors(frames, found, kind="false", count=1, ax=new_axes())
-    left, right, bottom, top = axes.images[0].get_extent()
-    height, width = axes.images[0].get_array().shape[:2]
-    x1, y1, x2, y2 = drawn_boxes(axes.collections[-1])[0]
-    pixel = (right - left) / width
-    assert (bottom - top) / height == pytest.approx(pixel)
-    # the crop starts at the frame's corner
-    assert np.array([x1 - left, y1 - top, x2 - left, y2 - top]) / pixel == pytest.approx([5, 5, 45, 45])
 
 
 def test_perfect_detections_have_no_errors_to_show(tmp_path):
@@ -128,27 +114,6 @@ def test_the_tradeoff_marks_the_pareto_front():
     assert not other.texts
 
 
-def test_names_of_the_tradeoff_stay_in_the_axes():
-    names = ["orient=9, color_space=YCrCb, C=1"] * 4
-    columns = {"accuracy": [0.97, 0.98, 0.99, 0.999], "search_ms": [4.0, 5.0, 8.0, 9.0]}
-    axes = notebook.plot_tradeoff(pd.DataFrame({"configuration": names} | columns))
-    assert max(axes.get_yticks()) == pytest.approx(1)
-    axes.figure.canvas.draw()
-    frame = axes.get_window_extent()
-    for text in axes.texts:
-        extent = text.get_window_extent()
-        assert frame.x0 <= extent.x0 < extent.x1 <= frame.x1
-        assert frame.y0 <= extent.y0 < extent.y1 <= frame.y1
-
-
-def test_names_of_sources_do_not_overlap():
-    frames, _ = labelled()
-    scores = evaluate_detections(frames.labels, frames.labels)
-    axes = notebook.plot_f1({f"source of frames number {number}": scores for number in range(8)})
-    axes.figure.canvas.draw()
-    assert {text.get_rotation() for text in axes.get_xticklabels()} == {30}
-
-
 def test_a_parameter_is_plotted_with_the_deviation_of_its_runs():
     table = pd.DataFrame({"C": [1e-4, 1e-4, 1.0, None], "split": ["x"] * 4, "accuracy": [0.9, 1.0, 0.8, 0.1]})
     axes = notebook.plot_parameter(table, "C", by="split", ax=new_axes())
@@ -177,13 +142,6 @@ def test_parameters_may_be_text_or_numbers():
     assert texts(notebook.plot_parameter(mixed, "C", ax=new_axes()).get_xticklabels()) == ["1", "ALL"]
 
 
-def test_many_lines_differ_in_color_or_style():
-    table = pd.DataFrame({"C": 1.0, "seed": range(9), "accuracy": 0.9})
-    axes = notebook.plot_parameter(table, "C", by="seed", ax=new_axes())
-    styles = {(str(line[0].get_color()), line[0].get_linestyle()) for line in axes.containers}
-    assert len(styles) == 9
-
-
 def test_the_legend_counts_the_errors_of_both_classes():
     scores, labels = [2.0, 1.0, -0.25, 0.0, -1.0, 0.5], [1, 1, 1, 1, 0, 0]
     axes = notebook.plot_scores(scores, labels, bins=12, ax=new_axes())
@@ -195,18 +153,3 @@ def test_the_legend_counts_the_errors_of_both_classes():
     assert axes.lines[0].get_xdata() == [0, 0]
     strict = notebook.plot_scores(scores, labels, threshold=1.5, ax=new_axes())
     assert legend(strict)[:2] == ["vehicles: 3 of 4 missed", "other: 0 of 2 classified as vehicles"]
-
-
-@settings(max_examples=30)
-@given(
-    scores=st.lists(st.floats(-50, 50), min_size=1, max_size=30),
-    threshold=st.floats(-60, 60),
-    bins=st.integers(1, 80),
-)
-def test_every_score_is_in_a_bin_and_the_threshold_is_an_edge(scores, threshold, bins):
-    axes = notebook.plot_scores(
-        scores, [index % 2 for index in range(len(scores))], threshold=threshold, bins=bins, ax=new_axes()
-    )
-    data = [patch.get_data() for patch in axes.patches[::2]]
-    assert sum(part.values.sum() for part in data) == len(scores)
-    assert np.abs(data[0].edges - threshold).min() == 0

@@ -5,11 +5,9 @@ from tests.notebook.helpers import drawn_boxes, gray_image, new_axes, texts, tit
 from vehicle_detection import notebook
 from vehicle_detection.boxes import Detections
 from vehicle_detection.heatmap import HeatParams, bounding_boxes, frame_heat
-from vehicle_detection.images import read_image
 from vehicle_detection.notebook.style import SKY, VERMILION, YELLOW
-from vehicle_detection.search import SearchBand, SearchParams
-from vehicle_detection.svm import load_classifier
-from vehicle_detection.windows import band_windows, find_cars
+from vehicle_detection.search import SearchParams
+from vehicle_detection.windows import band_windows
 
 
 def test_windows_are_colored_by_score_best_last():
@@ -62,12 +60,6 @@ def test_bands_are_drawn_where_they_are_searched(preset):
     assert colors == [pytest.approx(color) for color in (YELLOW, SKY, VERMILION)]
 
 
-def test_a_band_may_have_one_row_of_windows():
-    search = SearchParams(bands=(SearchBand(window=(640, 640), y=(-320, 320)),), horizon=0.5)
-    figure = notebook.plot_bands(gray_image(360, 360), search)
-    assert len(figure.axes[0].collections[1].get_segments()) == 1  # to the right only
-
-
 def test_the_comparison_shows_all_scores_and_their_maximum_difference():
     reference = np.linspace(-3, 2, 50)
     fast = reference + np.where(np.arange(50) == 7, -3e-6, 1e-6)
@@ -77,15 +69,6 @@ def test_the_comparison_shows_all_scores_and_their_maximum_difference():
     assert right.get_title() == "maximum difference 3e-06"
     assert sum(bar.get_height() for bar in right.patches) == 50
     assert notebook.plot_comparison([1.0], [1.0]).axes[1].get_title() == "maximum difference 0"
-
-
-@pytest.mark.parametrize("fastest", [0.01, 29.9])
-def test_texts_of_speedups_stay_in_the_axes(fastest):
-    times = {"the method of the course (scaler, SVM)": 30.0, "other": fastest, "b": 29.8}
-    axes = notebook.plot_speedups(times)
-    axes.figure.canvas.draw()
-    right = axes.get_window_extent().x1
-    assert all(text.get_window_extent().x1 <= right for text in axes.texts)
 
 
 def test_speedups_over_the_slowest_or_a_chosen_method():
@@ -129,13 +112,3 @@ def test_a_given_heat_map_is_used():
     without = notebook.plot_heatmap(gray_image(), Detections.empty())
     assert without.axes[2].get_title() == "0 regions above 2"
     assert without.axes[1].images[0].get_clim() == (0, 1)
-
-
-@pytest.mark.realdata
-def test_windows_and_heat_of_a_real_frame(real_data):
-    image = read_image(real_data / "test_images" / "test1.jpg")
-    windows = find_cars(image, load_classifier(), jobs=1)
-    figure = notebook.plot_heatmap(image, windows)
-    assert len(figure.axes[2].collections[0].get_segments()) >= 2
-    axes = notebook.plot_windows(image, windows, ax=new_axes())
-    assert len(axes.collections[0].get_array()) == len(windows)

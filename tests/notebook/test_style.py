@@ -1,5 +1,4 @@
 import matplotlib.pyplot as plt
-import numpy as np
 from matplotlib.figure import Figure, SubFigure
 
 from tests.notebook.helpers import gray_image, new_axes
@@ -24,14 +23,3 @@ def test_a_single_panel_uses_the_given_axes_or_a_pyplot_figure():
     assert not plt.get_fignums()
     own = notebook.plot_windows(gray_image(), [[1, 2, 30, 40]])
     assert plt.get_fignums() == [own.figure.number]
-
-
-def test_inputs_are_not_modified(patch_set):
-    image, windows = gray_image(), Detections([[0.0, 0, 64, 64]], [1.0])
-    before = image.copy(), windows.boxes.copy(), patch_set.fingerprint
-    notebook.plot_heatmap(image, windows)
-    notebook.plot_windows(image, windows, ax=new_axes())
-    notebook.plot_patches(patch_set, ax=new_axes())
-    np.testing.assert_array_equal(image, before[0])
-    np.testing.assert_array_equal(windows.boxes, before[1])
-    assert patch_set.fingerprint == before[2]

@@ -128,17 +128,6 @@ def test_at_least_one_frame_is_held_out():
     assert ([source.name for source in kept], [source.name for source in held_out]) == (["a", "b"], ["c"])
 
 
-def test_frames_without_vehicles_stay_in_their_part():
-    _, held_out = hold_out([FrameDataset("road", (numbered(10, vehicles=[0, 5]),))])
-    assert keys(held_out) == [[2, 7]]
-    assert len(held_out[0].sets[0].labels) == 0
-
-
-def test_the_only_vehicle_is_trained_on():
-    source = FrameDataset("road", (numbered(10, vehicles=[2]),))
-    assert hold_out([source]) == ([source], [])
-
-
 # --- bad input ---
 
 

@@ -106,26 +106,11 @@ def write_source(root, name, frames, rows):
     (root / "labels" / f"{name}.csv").write_text("frame,track,x1,y1,x2,y2\n" + "".join(rows))
 
 
-def test_a_source_without_vehicles(tmp_path):
-    write_source(tmp_path, "empty", 3, [])
-    (source,) = find_sources(tmp_path)
-    assert [len(frame.boxes) for frame in load_training_frames([source])] == [0, 0, 0]
-
-
 def frames_of(height, width):
     """A source of one frame with a vehicle and an ignored box."""
     image = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
     labels = TrackTable([0, 0], None, [[10, 20, 60, 50], [0, 0, width, 10]], ignore=[False, True])
     return FrameDataset("road", (LabelledFrames("road", [image], labels),)), image
-
-
-def test_small_frames_are_loaded_as_they_are():
-    source, image = frames_of(90, 160)
-    for limit in (None, 160, 500):
-        (frame,) = load_training_frames([source], max_side=limit)
-        np.testing.assert_array_equal(frame.image, image)
-        assert (frame.boxes.tolist(), frame.ignored.tolist()) == ([[10, 20, 60, 50]], [[0, 0, 160, 10]])
-        assert frame.source == "road"
 
 
 @pytest.mark.parametrize(("height", "width"), [(90, 160), (160, 90)])

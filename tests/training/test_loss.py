@@ -58,11 +58,3 @@ def test_ignored_boxes_have_no_loss():
     assert counted.item() > 1
     assert score.item() < 1e-3
     assert box.item() == 0
-
-
-def test_frames_without_vehicles_only_lower_scores():
-    logits, boxes = predict(logit=0.0)
-    logits.requires_grad_()
-    score, box = detection_loss(logits, boxes, CENTERS, targets())
-    (score + box).backward()
-    assert bool((logits.grad > 0).all())

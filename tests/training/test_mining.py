@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from tests.training.trial_cases import SEARCH, SMALL
-from vehicle_detection.datasets import PatchSet, load_frames
+from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams
-from vehicle_detection.images import write_image
 from vehicle_detection.search import SearchBand, SearchParams
 from vehicle_detection.tables import TrackTable
 from vehicle_detection.training import TrainingOptions, mine_negatives, train_classifier
@@ -55,27 +54,6 @@ def test_a_mined_patch_is_the_window_that_was_searched(random_svm):
     assert mined_scores == sorted(mined_scores, reverse=True)
 
 
-def test_a_window_outside_the_frame_repeats_its_border(random_svm):
-    image = np.random.default_rng(4).integers(0, 256, (200, 1280, 3), np.uint8)
-    search = SearchParams(
-        bands=(SearchBand(window=(64, 64), y=(0, 100)),), horizon=0.25, horizontal_padding=0.5
-    )
-    mined = mine_negatives(
-        [image],
-        TrackTable([], None, [], frame_keys=[0]),
-        random_svm,
-        search_params=search,
-        min_score=-1e6,
-        max_overlap=1,
-    )
-    _, boxes = boxes_of(mined)
-    row = int(boxes[:, 0].argmin())
-    left, top = boxes[row, :2]
-    assert left == -32
-    np.testing.assert_array_equal(mined.patches[row][:, :32], image[top : top + 64, :1].repeat(32, axis=1))
-    np.testing.assert_array_equal(mined.patches[row][:, 32:], image[top : top + 64, :32])
-
-
 def test_options_limit_the_number_of_windows(frames, labels, random_svm):
     def count(**options):
         return len(mine_negatives(frames.frames, labels, random_svm, search_params=SEARCH, **options))
@@ -98,14 +76,6 @@ def test_training_with_mined_patches_removes_false_positives(patch_set, frames, 
     counts = [(each.decision_function(mined.patches) > -0.5).sum() for each in (before, after)]
     assert counts[1] < counts[0] / 2
     assert after.score(few.patches, few.labels) > 0.9
-
-
-def test_frames_of_a_folder_are_mined_by_name(tmp_path, scenes, random_svm):
-    write_image(tmp_path / "road one.png", scenes[0].image)
-    boxes = TrackTable(["road one.png"], None, [[0, 0, 5, 5]])
-    mined = mine_negatives(load_frames(tmp_path), boxes, random_svm, search_params=SEARCH, source="road")
-    assert mined.names[0].startswith("non-vehicles/road/road one.png_")
-    assert set(mined.sources) == {"road"}
 
 
 def test_invalid_arguments(frames, labels, random_svm):

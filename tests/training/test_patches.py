@@ -14,14 +14,12 @@ from vehicle_detection.datasets import (
     split_sources,
 )
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import FeatureParams, extract_features
+from vehicle_detection.features import FeatureParams
 from vehicle_detection.svm import load_classifier
 from vehicle_detection.training import (
     SPLITS,
     TrainingOptions,
-    fit_features,
     model_card,
-    patch_features,
     train_and_evaluate,
     train_classifier,
 )
@@ -126,19 +124,6 @@ def test_training_again_writes_the_same_file(patch_set, tmp_path, split):
     np.testing.assert_array_equal(patch_set.patches, before)
     assert load_classifier(tmp_path / "a").metadata["metrics"]["split"] == split
     assert report.accuracy == report.splits[split].accuracy
-
-
-def test_fitting_does_not_change_the_features(patch_set):
-    features = patch_features(patch_set.patches, SMALL, TrainingOptions())
-    assert (features.shape, features.dtype) == ((320, SMALL.length), np.float32)
-    np.testing.assert_array_equal(features[:160], extract_features(patch_set.patches, SMALL))
-    mirrored = np.ascontiguousarray(patch_set.patches[:, :, ::-1])
-    np.testing.assert_array_equal(features[160:], extract_features(mirrored, SMALL))
-    before = features.copy()
-    labels = patch_set.labels.astype(np.int64)
-    fitted = fit_features(features, labels, SMALL, TrainingOptions())
-    np.testing.assert_array_equal(features, before)
-    assert fitted.metadata["training"]["vehicles"] == 80
 
 
 def test_impossible_splits_are_skipped():

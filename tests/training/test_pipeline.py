@@ -10,7 +10,6 @@ from sklearn.svm import LinearSVC
 
 from tests.feature_cases import PATCHES
 from tests.helpers import rendered_patches
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, extract_features
 from vehicle_detection.training import PatchFeatures
 
@@ -29,14 +28,6 @@ def test_the_transformer_has_the_fields_and_defaults_of_feature_params():
     arguments = PatchFeatures().get_params()
     assert arguments.pop("jobs") is None
     assert arguments == dataclasses.asdict(FeatureParams())
-
-
-def test_fit_checks_the_parameters():
-    transformer = PatchFeatures(color_space="BGR")
-    with pytest.raises(InvalidInputError, match="color_space must be one of"):
-        transformer.fit(PATCHES)
-    with pytest.raises(InvalidInputError, match="source must be an"):
-        PatchFeatures().fit_transform(PATCHES / 255)
 
 
 def test_the_transformer_names_its_features():

@@ -1,6 +1,3 @@
-import math
-
-import numpy as np
 import pandas as pd
 import pytest
 from hypothesis import given, settings
@@ -10,7 +7,6 @@ from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.training import (
     RowStore,
     make_table,
-    numeric_column,
     pareto_front,
     read_results,
     write_results,
@@ -72,15 +68,6 @@ def test_a_trial_that_two_runs_measure_is_one_row(tmp_path, suffix):
     pd.testing.assert_frame_equal(read_results(path), example_table(2))
 
 
-def test_numpy_values_and_nan_are_converted(tmp_path):
-    row = {**example_row(0), "accuracy": np.float64(0.5), "frame_f1": math.nan, "message": "two\nlines"}
-    for suffix in (".csv", ".jsonl"):
-        RowStore(tmp_path / f"rows{suffix}", COLUMNS).add(row)
-        (read,) = read_results(tmp_path / f"rows{suffix}").to_dict("records")
-        assert (read["accuracy"], read["message"]) == (0.5, "two lines")
-        assert math.isnan(read["frame_f1"])
-
-
 def test_damaged_and_foreign_stores(tmp_path):
     path = tmp_path / "rows.csv"
     path.write_text("frame,track\n1,2\n")
@@ -134,19 +121,6 @@ def test_a_table_as_parquet(tmp_path):
         write_results(table, tmp_path / "a.xls")
 
 
-def test_missing_values_of_a_table():
-    table = make_table([{"name": "a", "ms": 3, "x": None}, {"name": "b", "ms": None, "x": None}])
-    assert table.columns.tolist() == ["name", "ms", "x"]
-    assert (table["ms"].dtype, table["x"].dtype) == (np.float64, np.float64)
-    np.testing.assert_array_equal(numeric_column(table, "ms"), [3, np.nan])
-    with pytest.raises(InvalidInputError, match="table has no column 'sec'; its columns are name, ms, x"):
-        numeric_column(table, "sec")
-    with pytest.raises(InvalidInputError, match="column 'name' must hold numbers only"):
-        numeric_column(table, "name")
-    with pytest.raises(InvalidInputError, match="table must be a pandas DataFrame, got"):
-        numeric_column([{"ms": 3}], "ms")
-
-
 points = st.lists(st.tuples(st.none() | st.integers(0, 5), st.none() | st.integers(0, 5)), max_size=12).map(
     lambda pairs: make_table(
         [{"accuracy": quality, "search_ms": cost} for quality, cost in pairs], ["accuracy", "search_ms"]
@@ -163,8 +137,3 @@ def test_no_row_beats_the_pareto_front(table):
         beaten = any((q >= quality and c < cost) or (q > quality and c <= cost) for q, c in measured)
         assert ((quality, cost) in front) == (not beaten)
     assert len(set(front)) == len(front)
-
-
-def test_the_pareto_front_keeps_the_index():
-    table = pd.DataFrame({"f1": [0.5, 0.7, 0.6], "ms": [9, 3, 1]}, index=["a", "b", "c"])
-    assert pareto_front(table, "f1", "ms").index.tolist() == ["c", "b"]

@@ -1,8 +1,3 @@
-import signal
-import subprocess
-import sys
-import time
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -108,12 +103,6 @@ def test_invalid_arguments_of_compare_configurations(patch_set, options, message
         compare(patch_set, arguments.pop("configurations"), **arguments)
 
 
-def test_a_bad_c_is_a_failed_row(patch_set):
-    table = compare(patch_set, [SMALL], C=[-1.0, 1.0])
-    assert table["status"].tolist() == ["failed", "ok"]
-    assert "C must be a number, greater than 0" in table["message"][0]
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -187,36 +176,6 @@ def test_an_interrupted_run_continues_from_its_store(patch_set, tmp_path, monkey
     pd.testing.assert_frame_equal(read_results(store), resumed)
 
 
-def test_a_killed_process_loses_nothing(tmp_path):
-    store = tmp_path / "rows.csv"
-    code = f"""
-import numpy as np
-from vehicle_detection.datasets import PatchSet
-from vehicle_detection.training import TrialOptions, compare_configurations
-patches = np.random.default_rng(0).integers(0, 256, (40, 64, 64, 3), np.uint8)
-names = [f"{{row % 2}}/{{row}}.png" for row in range(40)]
-patch_set = PatchSet(patches, np.arange(40) % 2 == 0, names)
-grid = [{{**{SMALL!r}, "hist_bins": bins}} for bins in range(1, 250)]
-untimed = TrialOptions(time_search=False)
-compare_configurations(patch_set, grid, splits="random", store={str(store)!r}, options=untimed)
-"""
-    process = subprocess.Popen([sys.executable, "-c", code])
-    try:
-        deadline = time.monotonic() + 300
-        while not (store.exists() and store.read_bytes().count(b"\n") > 3):
-            assert process.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-    finally:
-        process.kill()
-        process.wait()
-    assert process.returncode == -signal.SIGKILL
-    table = read_results(store)
-    assert len(table) >= 3
-    assert table["hist_bins"].tolist() == list(range(1, len(table) + 1))
-    assert set(table["status"]) == {"ok"}
-
-
 # search_parameters
 
 
@@ -260,18 +219,6 @@ def test_later_rounds_use_fewer_configurations_and_more_patches(patch_set):
     assert [len(values) for values in rounds] == [4, 2]
     assert rounds.index[1] == pytest.approx(2 * rounds.index[0], rel=0.01)
     assert 1e-9 not in rounds.iloc[1]
-
-
-def test_candidates_are_drawn_at_random(patch_set):
-    grid = {**SMALL_GRID, "C": [10.0**power for power in range(-8, 2)]}
-    halving = Halving(n_candidates=3, n_finalists=1, n_folds=2)
-    options = {"split": "random", "halving": halving, "options": UNTIMED}
-    drawn = []
-    for seed in (0, 0, 1):
-        table = search_parameters(patch_set, grid, random_state=seed, **options)
-        drawn.append(set(table[table["stage"] == "halving"]["C"]))
-    assert len(drawn[0]) == 3
-    assert drawn[0] == drawn[1] != drawn[2]
 
 
 def test_an_interrupted_search_continues_from_its_store(patch_set, tmp_path, monkeypatch):

@@ -80,15 +80,6 @@ def test_the_best_threshold_of_one_fold():
     assert best_threshold([fold_of([], []), fold_of([], [], frames=2, empty=2)]) == -4.0
 
 
-def test_every_vehicle_has_the_same_weight_in_the_best_threshold():
-    # One set is best at 0.9, another one at 0.1, where the first loses: the one with more vehicles decides.
-    strict = fold_of([0.9, 0.2, 0.15, 0.15, 0.15, 0.15], [True, False, False, False, False, False], frames=1)
-    few, many = fold_of([0.1], [True], frames=1), fold_of([0.1] * 4, [True] * 4)
-    assert 0.2 < best_threshold([strict]) <= 0.9
-    assert 0.2 < best_threshold([strict, few]) <= 0.9
-    assert best_threshold([strict, many]) <= 0.1
-
-
 def test_log_odds_increase_with_the_logit():
     rng = np.random.default_rng(0)
     logits = rng.uniform(-1, 1, 40)
