@@ -105,6 +105,7 @@ def test_frames_are_checked(evaluate):
         pytest.param(["07"], ["in/07.png"], id="folder and suffix of the labels"),
         pytest.param(["../in/07.jpg"], ["in/07.jpg"], id="longer path"),
         pytest.param(["07.5.jpg", "07.6.jpg"], ["07.5"], id="names with dots"),
+        pytest.param(["07.jpg"], ["in\\07.jpg", "in\\08.jpg"], id="backslashes"),
     ],
 )
 def test_frame_names_may_differ_by_folder_and_suffix(ours, theirs):
@@ -131,9 +132,16 @@ def test_frame_names_that_may_be_of_other_images_are_refused(ours, theirs):
         evaluate_detections(found, labels)
 
 
-def test_equal_names_are_not_compared_further():
-    found, labels = boxes_of(("a.jpg", 1, CAR), ("b", 1, CAR)), boxes_of(("a.jpg", 1, CAR), ("b.jpg", 1, CAR))
-    assert evaluate_detections(found, labels).fn == 1
+def test_names_may_differ_in_a_part_of_the_frames():
+    found = boxes_of(*((name, 1, CAR) for name in ("a.jpg", "b", "c/d.jpg")))
+    labels = boxes_of(*((name, 1, CAR) for name in ("a.jpg", "in\\b.jpg", "e/d.jpg")))
+    scores = evaluate_detections(found, labels)
+    assert (scores.tp, scores.fn, scores.fp) == (2, 1, 1)  # the folders c and e may hold other images
+
+
+def test_no_common_frame_is_a_warning(caplog):
+    evaluate_detections(boxes_of(("a.jpg", 1, CAR)), boxes_of(("a_jpg.rf.1b.jpg", 1, CAR)))
+    assert "predictions and labels share no frame; they hold 'a.jpg' and 'a_jpg" in caplog.text
 
 
 def same(first, second):

@@ -155,3 +155,9 @@ def test_frames_of_videos_that_are_labelled_in_part(tmp_path, labelled, chosen):
     (tmp_path / "labels" / "own.CSV").write_text("frame,track,x1,y1,x2,y2\n" + "".join(rows))
     (source,) = find_sources(tmp_path)
     assert list(source.sets[0].keys) == chosen
+
+
+def test_images_whose_labels_have_other_names_are_not_empty_frames(tmp_path):
+    write_source(tmp_path, "road", 3, ["in\\1.png,1,10,10,60,50\n", "2_png.rf.7a.png,1,10,10,60,50\n"])
+    (source,) = find_sources(tmp_path)
+    assert set(source.sets[0].keys) == set(source.sets[0].labels["frame"].tolist()) == {"1.png"}

@@ -200,6 +200,9 @@ def open_locked(part: Path) -> int | None:
             except OSError as error:  # a link, a folder, or the file of another user
                 raise BlockingIOError(error.errno, error.strerror) from error
         try:
+            status = os.fstat(handle)
+            if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:  # a pipe, or also another's file
+                raise BlockingIOError(errno.EWOULDBLOCK, "not a file of its own")
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             with contextlib.suppress(FileNotFoundError):
                 # Another process may have renamed or removed the file before it was locked.

@@ -11,7 +11,9 @@ import contextlib
 import functools
 import json
 import os
+import re
 import shutil
+import stat
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -43,6 +45,10 @@ COUNTS = {"done": DONE, "failed": FAILED, "errors": ERROR}
 """Status of the trips that `BatchReport` and `BatchStatus` count by these names."""
 
 _FOLDER = "records"
+# Values of a record by their kind, where they are given.
+_TEXTS = ("message", "camera", "date", "start", "damage")
+_NUMBERS, _MAX_NUMBER = ("frames", "tracks", "video_seconds", "seconds"), 1e15
+_MAX_RECORD_BYTES = 100_000_000
 _SUMMARY_COLUMNS = (
     "key", "status", "camera", "date", "start", "first_file", "files", "frames", "video_seconds", "tracks",
     "work_seconds", "message", "damage", "tracks_file", "video_file",
@@ -91,6 +97,7 @@ class Store:
         # A path may look like a URL with two schemes, "a::b".
         self._filesystem, root = open_filesystem("file://" if self._folder else name, "out")
         self._root = name if self._folder else root.rstrip("/")
+        self._checked = set[str]()  # folders that no link leads to
 
     def _request(self, what: str, request: Callable[[], Result]) -> Result:
         try:
@@ -105,10 +112,18 @@ class Store:
             ) from error
 
     def _path(self, path: str) -> str:
+        """Full path. A link to another folder, whose files are not the batch's, is refused."""
+        parent = path.rpartition("/")[0]
+        if self._folder and parent not in self._checked:
+            if Path(os.path.realpath(self._folder / parent)) != Path(os.path.realpath(self._folder), parent):
+                raise OutputError(f"{self._folder / parent} leads through a link; replace that by a folder")
+            self._checked.add(parent)
         return f"{self._root}/{path}"
 
     def exists(self, path: str) -> bool:
         """Whether there is a file."""
+        if self._folder:
+            return _is_file(self._path(path))
 
         def find() -> None:
             self._filesystem.invalidate_cache()
@@ -122,6 +137,8 @@ class Store:
 
     def read(self, path: str) -> bytes | None:
         """Content of a file; None if there is none."""
+        if self._folder and not _is_file(self._path(path)):  # a pipe would block
+            return None
         # `cat_file` takes ten times as long for each of many thousand small local files.
         read_file = _read_file if self._folder else self._filesystem.cat_file
         try:
@@ -152,7 +169,7 @@ class Store:
 
         def find() -> list[str]:
             self._filesystem.invalidate_cache()
-            return [str(name) for name in self._filesystem.find(self._path(folder), **options)]
+            return [str(name) for name in self._filesystem.find(self._path(f"{folder}/"), **options)]
 
         try:
             names = self._request(f"/{folder} cannot be listed", find)
@@ -179,6 +196,8 @@ class Store:
         target, what = self._path(path), f"/{path} cannot be written"
         if self._folder:
             Path(target).parent.mkdir(parents=True, exist_ok=True)
+            if os.path.islink(target):  # replaced, not followed
+                os.unlink(target)
             with atomic_write(target) as part:
                 copy(part)
             return
@@ -204,8 +223,12 @@ class Store:
         if self._folder is None or sys.platform == "win32":
             yield True
             return
-        path = self._folder / "locks" / f"{name}.lock"
+        path = Path(self._path(f"locks/{name}.lock"))
         path.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileNotFoundError):
+            status = path.lstat()
+            if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1 or status.st_size:
+                raise OutputError(f"{path} is not the lock of a batch; remove it")
         with contextlib.ExitStack() as stack:
             locked = True
             try:
@@ -219,9 +242,16 @@ class Store:
             yield locked
 
 
+def _is_file(path: str | os.PathLike[str]) -> bool:
+    """Whether a path is a regular file, and not a link to one."""
+    with contextlib.suppress(OSError, ValueError):
+        return stat.S_ISREG(os.lstat(path).st_mode)
+    return False
+
+
 def _read_file(path: str) -> bytes:
     with open(path, "rb") as file:
-        return file.read()
+        return file.read(_MAX_RECORD_BYTES)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,17 +311,31 @@ def record_path(key: str) -> str:
 def read_records(store: Store, keys: Iterable[str] | None = None) -> dict[str, dict[str, Any]]:
     """Read the records of trips, or of all, by their keys; missing or damaged ones are left out."""
     found = store.read_many(record_path(key) for key in (record_keys(store) if keys is None else keys))
-    parsed = ((_key(path), _parse(data)) for path, data in found)
+    parsed = ((key, _parse(key, data)) for key, data in ((_key(path), data) for path, data in found))
     return {key: record for key, record in parsed if record is not None}
 
 
-def _parse(data: bytes) -> dict[str, Any] | None:
+def _parse(key: str, data: bytes) -> dict[str, Any] | None:
+    """Record of a trip, from a file that anybody may have changed; None if it is of another shape."""
     try:
         record = json.loads(data)
     except (ValueError, RecursionError):
         return None
-    whole = isinstance(record, dict) and "status" in record and bool(record.get("sources"))
-    return record if whole else None
+    if not isinstance(record, dict) or record.get("status") not in (DONE, FAILED, ERROR):
+        return None
+    given = {name: value for name, value in record.items() if value is not None}
+    sources, outputs = given.get("sources"), given.get("outputs", {})
+    # The outputs of a record may be removed: they are files of this trip, and nothing else.
+    output = rf"(tracks|videos)/date=[^/\\]+/camera=[^/\\]+/{re.escape(key)}\.(parquet|mp4)"
+    shaped = isinstance(sources, list) and isinstance(outputs, dict) and sources
+    whole = shaped and (
+        all(isinstance(each, dict) and isinstance(each.get("uri"), str) for each in sources)
+        and all(isinstance(path, str) and re.fullmatch(output, path) for path in outputs.values())
+        and all(isinstance(given.get(name, ""), str) for name in _TEXTS)
+        and all(isinstance(given.get(name, 0), (int, float)) for name in _NUMBERS)
+        and all(0 <= given.get(name, 0) < _MAX_NUMBER for name in _NUMBERS)
+    )
+    return record | {"key": key, "outputs": outputs} if whole else None
 
 
 def _key(path: str) -> str:
@@ -310,7 +354,7 @@ def is_complete(record: Mapping[str, Any] | None, exists: Callable[[str], bool])
     """
     if record is None or record["status"] == ERROR:
         return False
-    return all(map(exists, record.get("outputs", {}).values()))
+    return all(map(exists, record["outputs"].values()))
 
 
 def record_keys(store: Store) -> list[str]:
@@ -362,7 +406,7 @@ def batch_summary(out: str | os.PathLike[str]) -> pandas.DataFrame:
 
 
 def _summary_row(key: str, record: Mapping[str, Any]) -> dict[str, Any]:
-    sources, outputs = record["sources"], record.get("outputs", {})
+    sources, outputs = record["sources"], record["outputs"]
     row: dict[str, Any] = {**dict.fromkeys(_SUMMARY_COLUMNS), **record}
     row |= {"key": key, "first_file": sources[0]["uri"], "files": len(sources)}
     row |= {f"{kind}_file": outputs.get(kind) for kind in ("tracks", "video")}

@@ -38,7 +38,13 @@ from vehicle_detection.drive.batch_store import (
     record_path,
     write_record,
 )
-from vehicle_detection.errors import InvalidInputError, TransientVideoError, VehicleDetectionError, VideoError
+from vehicle_detection.errors import (
+    InvalidInputError,
+    OutputError,
+    TransientVideoError,
+    VehicleDetectionError,
+    VideoError,
+)
 from vehicle_detection.formats import DIGITS, track_records
 from vehicle_detection.network import Device
 from vehicle_detection.video import FrameSource, download, open_source, process_video
@@ -108,7 +114,14 @@ def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
     Only one process works on a trip at a time. Outputs are complete or absent, and the record is written
     last.
     """
-    store, key = open_store(task["out"], create=True), task["key"]
+    try:
+        return _run_locked(open_store(task["out"], create=True), task)
+    except OutputError as error:  # no access, or a file in `out` that is not the batch's
+        return {name: task[name] for name in RECORDED} | _failure(error) | {"new": True}
+
+
+def _run_locked(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
+    key = task["key"]
     with store.lock(identity_of(key)) as locked:
         if not locked:
             return {"key": key, "status": BUSY, "sources": task["sources"]}
@@ -274,7 +287,7 @@ def _remove_earlier(store: Store, task: Mapping[str, Any], facts: Mapping[str, A
     for key, record in read_records(store, task.get("replaces", ())).items():
         if failed and record["status"] == DONE:
             continue
-        for path in record.get("outputs", {}).values():
+        for path in record["outputs"].values():
             store.remove(path)
         store.remove(record_path(key))
     if failed:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,32 +16,39 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.formats import without_suffix
 from vehicle_detection.tables import NO_TRACK, FrameKey, TrackTable, check_keys, frame_order
 
+log = logging.getLogger(__name__)
+
 
 def match_names(table: TrackTable, keys: Sequence[FrameKey], sides: tuple[str, str]) -> TrackTable:
-    """Rename frames to `keys` where the names differ by a folder or the suffix of an image only.
+    """Rename frames to `keys` where the names differ by folders, slashes or the suffix of an image only.
 
-    Nothing is renamed if a frame is among `keys`. Names that are not unique then are an error, which names
-    `table` and `keys` by `sides`.
+    A name that may be that of several frames is an error, which names `table` and `keys` by `sides`, and so
+    is one of another folder unless other names are equal.
     """
-    if set(table.frame_keys) & set(keys):
-        return table
-    ours, theirs = (
-        {PurePosixPath(without_suffix(key)).name: key for key in side if isinstance(key, str)}
-        for side in (table.frame_keys, keys)
-    )
-    shared = ours.keys() & theirs.keys()
-    if not shared:
-        return table
-    paths = [[f"/{without_suffix(side[name])}" for side in (ours, theirs)] for name in sorted(shared)]
-    different = [pair for pair in paths if not (pair[0].endswith(pair[1]) or pair[1].endswith(pair[0]))]
-    if different or len(ours) < len(table.frame_keys) or len(theirs) < len(keys):
-        name = min(shared)
-        raise InvalidInputError(
-            f"frame names of {sides[0]} and {sides[1]} differ: {ours[name]!r} and {theirs[name]!r}; use the "
-            "same names on both sides, for example with TrackTable.renamed"
-        )
-    names = {ours[name]: theirs[name] for name in shared}
-    return table.renamed(lambda key: names.get(key, key))
+    equal = set(table.frame_keys) & set(keys)
+    by_name: dict[str, list[tuple[str, str]]] = {}
+    for key in keys:
+        if isinstance(key, str) and key not in equal:
+            by_name.setdefault(_path_of(key).rpartition("/")[2], []).append((key, _path_of(key)))
+    names: dict[FrameKey, str] = {}
+    taken = set[str]()
+    for ours in table.frame_keys:
+        path = _path_of(ours) if isinstance(ours, str) and ours not in equal else ""
+        others = by_name.get(path.rpartition("/")[2], [])
+        alike = [key for key, other in others if path.endswith(other) or other.endswith(path)]
+        if len(alike) > 1 or not taken.isdisjoint(alike) or (others and not alike and not equal):
+            raise InvalidInputError(
+                f"frame names of {sides[0]} and {sides[1]} differ: {ours!r} and {others[0][0]!r}; use the "
+                "same names on both sides, for example with TrackTable.renamed"
+            )
+        taken.update(alike)
+        names |= dict.fromkeys([ours], *alike) if alike else {}
+    return table.renamed(lambda key: names.get(key, key)) if names else table
+
+
+def _path_of(name: str) -> str:
+    """Name of a frame as a path from a root, with slashes, without the suffix of an image."""
+    return "/" + without_suffix(name.replace("\\", "/"))
 
 
 def prepare_evaluation(
@@ -64,6 +71,8 @@ def prepare_evaluation(
         raise InvalidInputError(
             f"frame keys must be all numbers or all names, got {listed}; use the same keys on both sides"
         )
+    if given is None and len(first) == 2 and set(predictions.frame_keys).isdisjoint(labels.frame_keys):
+        log.warning("predictions and labels share no frame; they hold %r and %r", *first.values())
     if given is None:
         return predictions, labels, sorted({*predictions.frame_keys, *labels.frame_keys}, key=frame_order)
     for key, count in Counter(given).items():

@@ -5,7 +5,8 @@ Every table has the columns ``frame,track_id,x1,y1,x2,y2,score``. Tables of trac
 detections in images with ``confidence``.
 """
 
-from vehicle_detection.formats.read import FORMATS, read_labels, without_suffix
+from vehicle_detection.formats.read import FORMATS, read_labels
+from vehicle_detection.formats.rows import without_suffix
 from vehicle_detection.formats.write import DIGITS, open_tracks, track_records, write_labels, write_tracks
 
 __all__ = [

@@ -9,8 +9,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from vehicle_detection._common import Limit, read_regular_file
 from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection.formats.rows import Record, read_text
 from vehicle_detection.tables import (
     CORNERS,
     LOOKALIKE_CLASSES,
@@ -23,20 +23,21 @@ from vehicle_detection.tables import (
     parse_number,
 )
 
-Record = dict[str, Any]
-"""Values of a row by the names of their columns, None where a value is unknown."""
 Write = Callable[[FrameKey, Sequence[Record]], None]
 """Writes rows of a frame, of which there may be none."""
 
+# Keys of other tools' JSON, in the whole or its first entry.
+_OTHER_TOOLS = (
+    ({"shapes", "imagePath"}, "Labelme or X-AnyLabeling"),
+    ({"labels", "name"}, "BDD100K (Scalabel)"),
+    ({"data", "annotations"}, "Label Studio"),
+    ({"annotator", "image"}, "Label Studio"),
+    ({"regions", "filename"}, "the VGG Image Annotator"),
+    ({"_via_img_metadata"}, "the VGG Image Annotator"),
+    ({"items", "categories", "info"}, "Datumaro"),
+    ({"objects", "size"}, "Supervisely"),
+)
 _CATEGORIES = [{"id": 1, "name": "vehicle", "supercategory": "vehicle"}]
-
-
-def read_text(file: Path) -> str:
-    """Read a file of UTF-8 text of limited size."""
-    try:
-        return read_regular_file(file, str(file), Limit.TEXT_BYTES, error=DatasetError).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise DatasetError(f"{file} is not UTF-8 text; save it as UTF-8") from None
 
 
 def json_reason(error: ValueError | RecursionError) -> str:
@@ -70,6 +71,11 @@ def _read_file(source: Path, truth: Path | None = None) -> CocoFile:
             )
         return _read_file(truth)._replace(annotations=data)
     parts = data if isinstance(data, dict) else {}
+    first = data[0] if isinstance(data, list) and data else next(iter(parts.values()), None)
+    keys = {*parts, *(first if isinstance(first, dict) else ())}
+    other = next((tool for needed, tool in _OTHER_TOOLS if needed <= keys), None)
+    if other is not None:
+        raise DatasetError(f"{source} is the JSON of {other}, which is not read; export COCO there")
     needed = ("images", "annotations", "categories")
     missing = [name for name in needed if not isinstance(parts.get(name), list)]
     if missing:
@@ -122,16 +128,27 @@ def read_coco(
             ) from None
         if category not in vehicles and name not in LOOKALIKE_CLASSES:
             continue
+        entry = _with_attributes(entry)
         ignore = bool(entry.get("iscrowd") or entry.get("ignore") or category not in vehicles)
         # An ignored box without a track would be a region.
         track = entry.get("track_id", number if ignore and entry.get("score") is None else NO_TRACK)
         # A crowd is a region, except for the ignored vehicles that are written here, which are marked twice.
         if entry.get("iscrowd") and not (entry.get("ignore") and "track_id" in entry):
             track = NO_TRACK
-        record = {name: entry.get(name) for name in TRACK_COLUMNS[6:]}
+        record = {name: entry.get(name) for name in (*TRACK_COLUMNS[6:], "occluded", "truncated")}
         record |= {"frame": frame, "track_id": track, "ignore": ignore}
         rows.append((where, record | dict(zip(CORNERS, (x, y, x + width, y + height)))))
     return rows, list(file.images.values())
+
+
+def _with_attributes(entry: dict[str, Any]) -> dict[str, Any]:
+    """Add what CVAT and Datumaro write into ``attributes``, where true and false stand for 1 and 0."""
+    attributes = entry.get("attributes")
+    inner = attributes if isinstance(attributes, dict) else {}
+    known = {name: inner[name] for name in ("track_id", "occluded", "truncated") if name in inner}
+    known |= {"track_id": entry["instance_id"]} if "instance_id" in entry else {}  # of MMTracking
+    flags = {name: int(value) for name, value in (known | entry).items() if isinstance(value, bool)}
+    return known | entry | flags
 
 
 def without_noise(value: float) -> float:

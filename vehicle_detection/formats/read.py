@@ -12,9 +12,9 @@ import os
 import re
 import zipfile
 import zlib
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from collections.abc import Collection, Iterable, Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,17 +24,24 @@ from vehicle_detection._common import (
     check_path,
     check_regular_file,
     check_sequence,
-    check_shape,
     describe,
     import_pyarrow,
-    read_regular_file,
     shorten,
 )
-from vehicle_detection.boxes import clip_boxes, logit
-from vehicle_detection.datasets import FrameSet, is_image, load_frames
-from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.formats.coco import Record, json_reason, read_coco, read_text
-from vehicle_detection.images import image_size, read_image
+from vehicle_detection.boxes import clip_boxes
+from vehicle_detection.datasets import load_frames
+from vehicle_detection.errors import DatasetError
+from vehicle_detection.formats.coco import json_reason, read_coco
+from vehicle_detection.formats.rows import (
+    FRAME_NUMBER,
+    FileRows,
+    Record,
+    no_text_files,
+    read_lines,
+    read_text,
+    rows_of_records,
+)
+from vehicle_detection.formats.yolo import read_yolo
 from vehicle_detection.tables import (
     BOX_COLUMNS,
     CORNERS,
@@ -62,37 +69,11 @@ FORMATS = {
 FOLDER_FORMATS = ("kitti", "yolo")
 """Formats that are folders, which are named instead of chosen by a suffix."""
 
-FRAME_NUMBER = re.compile(r"-?(0|[1-9][0-9]{0,17})(\.0*)?")
-"""Text of a frame that is a number. One with leading zeros is a file name."""
 PERSON_CLASSES = ("pedestrian", "person_sitting", "cyclist")
 
 _LABELS = ("frame", "track", *CORNERS)
 # The project's labels do not score vehicles that are largely hidden, truncated by more, or narrower (px).
 _HIDDEN, _MAX_TRUNCATED, _MIN_WIDTH = 2, 0.7, 40.0
-# Confidences of 0 and 1 have infinite log-odds.
-_MIN_CONFIDENCE = 1e-6
-
-
-class FileRows(NamedTuple):
-    """Rows of a file."""
-
-    places: list[str]  # file and line of each, for messages
-    cells: dict[str, list[Any]]  # of each column
-    frames: Sequence[FrameKey] = ()  # that the file lists; they may have no row
-
-
-def _rows_of_records(rows: Iterable[tuple[str, Record]], frames: Sequence[FrameKey] = ()) -> FileRows:
-    """Collect records; a cell that a record lacks is missing."""
-    places, records = zip(*listed) if (listed := list(rows)) else ((), ())
-    names = dict.fromkeys(name for record in records for name in record) or BOX_COLUMNS[:-1]
-    return FileRows(list(places), {name: [record.get(name) for record in records] for name in names}, frames)
-
-
-def _read_lines(file: Path, text: str | None = None) -> Iterator[tuple[str, str]]:
-    """Yield the lines of a file, or of a text in it, that are not blank, after their places for messages."""
-    for number, line in enumerate((read_text(file) if text is None else text).splitlines(), 1):
-        if line.strip(", \t"):
-            yield f"{file} line {number}", line.strip()
 
 
 def _split_words(line: str) -> list[str]:
@@ -153,7 +134,7 @@ def _read_json_lines(source: Path, classes: Collection[str] | None) -> FileRows:
                 raise DatasetError(f"{where}: not a JSON object ({json_reason(error)})") from None
             if not isinstance(rows[-1][1], dict):
                 raise DatasetError(f"{where}: expected a JSON object, found {line.strip()[:40]!r}")
-    return _check_columns(source, _rows_of_records(rows)) if rows else _rows_of_records(rows)
+    return _check_columns(source, rows_of_records(rows)) if rows else rows_of_records(rows)
 
 
 def _read_parquet(source: Path, classes: Collection[str] | None) -> FileRows:
@@ -170,29 +151,32 @@ def _read_parquet(source: Path, classes: Collection[str] | None) -> FileRows:
 def _read_kitti(source: Path, classes: Collection[str] | None) -> FileRows:
     files = list(source.glob("*.txt")) if source.is_dir() else [source]
     if not files:
-        raise _no_text_files(source, "a KITTI label_2 folder or a label file")
+        raise no_text_files(source, "a KITTI label_2 folder or a label file")
     rows: list[tuple[str, Record]] = []
     for file in sorted(files, key=lambda file: frame_order(file.name)):
-        for where, line in _read_lines(file):
-            record = _kitti_record(where, line.split(), classes)
+        for where, line in read_lines(file):
+            words, place = line.split(), {"frame": file.stem}
+            tracked = len(words) in (17, 18) and words[0].isdecimal()  # labels of KITTI's tracking
+            if tracked and len(files) > 1:
+                raise DatasetError(f"{source} holds tracks of several drives; name one of its files")
+            if tracked:
+                place = {"frame": int(words[0]), "track_id": words[1]}
+            record = _kitti_record(where, words[2:] if tracked else words, classes)
             if record is not None:
                 # `ignore` with NO_TRACK means a region, so an ignored vehicle gets a track number of its own.
                 track = len(rows) if record["ignore"] and "occluded" in record else NO_TRACK
-                rows.append((where, {"frame": file.stem, "track_id": track, **record}))
-    return _rows_of_records(rows, [file.stem for file in files])
-
-
-def _no_text_files(folder: Path, expected: str) -> DatasetError:
-    """Error of a folder without text files, which names a subfolder that has some, such as labels/train."""
-    inside = min((file.parent for file in folder.glob("*/*.txt")), default=None)
-    remedy = f"name {expected}" if inside is None else f"its subfolders are read one at a time: name {inside}"
-    return DatasetError(f"{folder} holds no .txt file; {remedy}")
+                rows.append((where, {"track_id": track, **place, **record}))
+    tracks = any(isinstance(record["frame"], int) for _, record in rows)
+    return rows_of_records(rows, () if tracks else [file.stem for file in files])
 
 
 def _kitti_record(where: str, words: list[str], classes: Collection[str] | None) -> Record | None:
     """One KITTI object; None for a person. One without `occluded` is a region."""
     if len(words) not in (15, 16):
-        raise DatasetError(f"{where}: a KITTI object has 15 values (16 with a score), found {len(words)}")
+        raise DatasetError(
+            f"{where}: a KITTI object has 15 values (16 with a score; 2 more before them with tracks), found "
+            f"{len(words)}"
+        )
     name = words[0].lower()
     corners = [parse_number(word, "corner of the box", where) for word in words[4:8]]
     score = words[15] if len(words) == 16 else None
@@ -211,13 +195,13 @@ def _kitti_record(where: str, words: list[str], classes: Collection[str] | None)
 
 
 def _read_mot(source: Path, classes: Collection[str] | None) -> FileRows:
-    rows = list(_mot_rows(_read_lines(source)))
+    rows = list(_mot_rows(read_lines(source)))
     if classes is not None and rows:
         found = {number for *_, number in rows if number is not None}
         if not found:
             raise DatasetError(f"{source} holds predictions, which have no classes; leave out classes=")
         check_classes(source, found, classes)
-    return _rows_of_records(
+    return rows_of_records(
         (where, record) for where, record, number in rows if classes is None or number in classes
     )
 
@@ -225,9 +209,10 @@ def _read_mot(source: Path, classes: Collection[str] | None) -> FileRows:
 def _mot_rows(
     lines: Iterable[tuple[str, str]], *, first_pixel: int = 1
 ) -> Iterator[tuple[str, Record, str | None]]:
-    """Yield each row of MOTChallenge text with its class number; predictions have none."""
-    for where, line in lines:
-        words = _split_words(line.rstrip(","))
+    """Yield each row of MOTChallenge text with its class number, None if it has none."""
+    rows = [(where, _split_words(line.rstrip(","))) for where, line in lines]
+    labelled = all(_is_mot_label(words) for _, words in rows)
+    for where, words in rows:
         if len(words) < 6:
             raise DatasetError(f"{where}: expected frame, id, x, y, width, height, found {len(words)} values")
         frame = parse_number(words[0], "frame (counted from 1)", where)
@@ -239,24 +224,39 @@ def _mot_rows(
         x, y = x - first_pixel, y - first_pixel
         record: Record = {"frame": int(frame) - 1, "track_id": words[1]}
         record |= zip(CORNERS, (x, y, x + width, y + height))
-        # Ground truth has nine columns, the last ones flag, class, visibility. Results have class -1 or ten.
-        if len(words) == 9 and words[7] != "-1":
-            yield where, record | {"ignore": parse_number(words[6], "flag", where) == 0}, words[7]
+        if labelled:
+            record["ignore"] = float(words[6]) == 0
         else:
-            yield where, record | {"score": words[6] if len(words) > 6 else None}, None
+            record["score"] = words[6] if len(words) > 6 else None
+        yield where, record, words[7] if len(words) in (8, 9) and words[7] != "-1" else None
+
+
+def _is_mot_label(words: list[str]) -> bool:
+    """Whether the last three of nine columns are those of ground truth: flag, class and visibility.
+
+    Trackers such as BoxMOT also write nine: confidence, class and -1.
+    """
+    try:
+        flag, number, visibility = map(float, words[6:])
+    except ValueError:  # fewer or more columns, or text
+        return False
+    return flag in (0, 1) and number >= 0 and 0 <= visibility <= 1
 
 
 def _read_mot_zip(source: Path, classes: Collection[str] | None) -> FileRows:
     """Read an archive of CVAT: MOTChallenge text whose pixels count from 0, and the names of the classes."""
     text, names = _read_members(source, "gt/gt.txt", "gt/labels.txt")
     if text is None:
-        raise DatasetError(f"{source} is not an archive of CVAT: it lacks gt/gt.txt; export MOT 1.1 there")
+        raise DatasetError(
+            f"{source} is not an archive of CVAT: it lacks gt/gt.txt; export MOT 1.1 there, or unpack an "
+            "archive of another format"
+        )
     wanted = VEHICLE_CLASSES if classes is None else classes
     labels = [name.strip().lower() for name in (names or "").splitlines() if name.strip()]
     if labels:
         check_classes(source, labels, wanted)
     rows = []
-    for where, record, number in _mot_rows(_read_lines(source, text), first_pixel=0):
+    for where, record, number in _mot_rows(read_lines(source, text), first_pixel=0):
         if labels and number is not None:
             index = parse_number(number, "class", where)
             if index not in range(1, len(labels) + 1):
@@ -267,7 +267,7 @@ def _read_mot_zip(source: Path, classes: Collection[str] | None) -> FileRows:
             if labels[int(index) - 1] not in wanted:
                 continue
         rows.append((where, record))
-    return _rows_of_records(rows)
+    return rows_of_records(rows)
 
 
 def _read_members(source: Path, *names: str) -> list[str | None]:
@@ -288,120 +288,6 @@ def _read_members(source: Path, *names: str) -> list[str | None]:
         raise DatasetError(f"{source} is not a zip archive that can be read ({error})") from None
     except UnicodeDecodeError:
         raise DatasetError(f"{source} does not hold UTF-8 text; save it as UTF-8") from None
-
-
-def _read_yolo(
-    source: Path, classes: Collection[str] | None, shape: Any, images: FrameSet | None
-) -> FileRows:
-    """Read a text file for each frame; the names of the classes are beside their folder, or unknown."""
-    if shape is None and images is None:
-        raise InvalidInputError(
-            "shape must be (height, width) of the frames for YOLO, got None; pass it, or the folder of "
-            "the images as images= or --images"
-        )
-    folder = source / "labels" if (source / "labels").is_dir() else source
-    files = [file for file in folder.glob("*.txt") if file.name != "classes.txt"]
-    without_frames = folder != source and not any(folder.iterdir())
-    if not files and not without_frames:
-        raise _no_text_files(folder, "a folder of YOLO labels")
-    names = _yolo_names(source)
-    wanted = VEHICLE_CLASSES if classes is None else classes
-    if names:
-        check_classes(source, names.values(), wanted)
-    files.sort(key=lambda file: frame_order(file.name))
-    frames = _yolo_frames(files, shape) if images is None else _yolo_images(files, images)
-    rows: list[tuple[str, Record]] = []
-    numbers: set[str] = set()
-    for file, (key, size) in zip(files, frames, strict=True):
-        for where, line in _read_lines(file):
-            name, record = _yolo_record(where, line.split(), size)
-            # Without names, classes are numbers, and by default all of them are vehicles.
-            numbers.add(name)
-            if (not names and classes is None) or names.get(name, name) in wanted:
-                rows.append((where, {"frame": key, **record}))
-    if not names and classes is not None and numbers:
-        check_classes(source, numbers, wanted)
-    return _rows_of_records(rows, [key for key, _ in frames])
-
-
-def _yolo_frames(files: Sequence[Path], shape: Any) -> list[tuple[FrameKey, tuple[int, ...]]]:
-    """Frame and shape of each file, all of one shape: numbers if all names have six digits."""
-    shape = check_shape(shape)
-    numbered = all(file.stem.isdecimal() and file.stem == f"{int(file.stem):06d}" for file in files)
-    return [(int(file.stem) if numbered else file.stem, shape) for file in files]
-
-
-def without_suffix(name: str) -> str:
-    """Return the name of a frame without the suffix of an image."""
-    path = PurePosixPath(name)
-    return name[: -len(path.suffix)] if is_image(path.name) else name
-
-
-def _yolo_images(files: Sequence[Path], images: FrameSet) -> list[tuple[FrameKey, tuple[int, ...]]]:
-    """Name and shape of the image of each file; the header has the shape, unless EXIF data may rotate it."""
-    names = {without_suffix(name): name for name in images.names}
-    frames: list[tuple[FrameKey, tuple[int, ...]]] = []
-    for file in files:
-        if file.stem not in names:
-            raise DatasetError(f"{file} has no image in {images.folder}; pass the folder of its image")
-        image = images.folder / names[file.stem]
-        data = read_regular_file(image, f"image file {image}", Limit.IMAGE_BYTES, error=DatasetError)
-        size = None if b"exif" in data.lower() else image_size(data)
-        frames.append((image.name, read_image(image).shape[:2] if size is None else size[::-1]))
-    return frames
-
-
-def _yolo_record(where: str, words: list[str], shape: tuple[int, ...]) -> tuple[str, Record]:
-    """Class and record of a line: class, center, size and, for predictions, confidence and track."""
-    if not 5 <= len(words) <= 7:
-        raise DatasetError(
-            f"{where}: expected class, center and size, and perhaps confidence and track, found {len(words)} "
-            "values"
-        )
-    x, y, width, height = (parse_number(word, "side of the box", where) for word in words[1:5])
-    if len(words) == 5 and not (abs(x - 0.5) < (1 + width) / 2 and abs(y - 0.5) < (1 + height) / 2):
-        raise DatasetError(
-            f"{where}: the box {' '.join(words[1:5])} lies outside the image; center and size are fractions "
-            "of the image in YOLO"
-        )
-    x, width, y, height = x * shape[1], width * shape[1], y * shape[0], height * shape[0]
-    corners = np.array([[x - width / 2, y - height / 2, x + width / 2, y + height / 2]])
-    record: Record = dict(zip(CORNERS, clip_boxes(corners, shape)[0].tolist()))
-    if len(words) > 5:
-        confidence = parse_number(words[5], "confidence", where)
-        if not 0 <= confidence <= 1:
-            raise DatasetError(f"{where}: confidence must be from 0 to 1, got {describe(words[5])}")
-        record["score"] = logit(min(max(confidence, _MIN_CONFIDENCE), 1 - _MIN_CONFIDENCE))
-        record["track_id"] = words[6] if len(words) > 6 else None
-    name = words[0].partition(".")[0] if FRAME_NUMBER.fullmatch(words[0]) else words[0]
-    return name, record
-
-
-def _yolo_names(source: Path) -> dict[str, str]:
-    """Lower-case name of each class number, from ``data.yaml`` or ``classes.txt``; empty if unknown."""
-    place = source.resolve()
-    for folder in (place, *place.parents[:2]):
-        if (folder / "data.yaml").is_file():
-            return _yaml_names(folder / "data.yaml")
-        if (folder / "classes.txt").is_file():
-            lines = read_text(folder / "classes.txt").splitlines()
-            return {str(number): name.strip().lower() for number, name in enumerate(lines)}
-    return {}
-
-
-def _yaml_names(file: Path) -> dict[str, str]:
-    """Value of ``names``: a list, or a mapping from numbers."""
-    import yaml
-
-    try:
-        data = next(yaml.safe_load_all(read_text(file)), None)  # of several documents, the first
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise DatasetError(f"{file} is not YAML text: {' '.join(str(error).split())}") from None
-    names = data.get("names") if isinstance(data, dict) else None
-    if not names or not isinstance(names, (list, dict)):
-        raise DatasetError(f"{file} names no class; write them as names: [car, bus]")
-    listed = enumerate(names) if isinstance(names, list) else names.items()
-    return {str(number): str(name).lower() for number, name in listed}
 
 
 # All have the same arguments; tables are filtered by class in `parse_cells`. The readers of COCO and YOLO
@@ -438,10 +324,11 @@ def read_labels(
           for predictions the columns of `write_tracks`; with a column ``class``, ``label`` or ``category`` of
           names, rows of other classes than vehicles are left out;
         - a JSON Lines or Parquet (needs pyarrow) file with these columns;
-        - a KITTI ``label_2`` folder or one of its files;
+        - a KITTI ``label_2`` folder or one of its files, or a file of KITTI's tracking;
         - a MOTChallenge text file, or the MOT archive of CVAT;
         - a COCO JSON file, or a list of COCO results;
-        - a YOLO folder: ``labels/*.txt``, with class names in ``data.yaml`` or ``classes.txt``.
+        - a YOLO folder: ``labels/*.txt``, with class names in ``data.yaml`` or ``classes.txt``, or an unpacked
+          YOLO archive of CVAT.
     format
         ``"csv"``, ``"jsonl"``, ``"parquet"``, ``"kitti"``, ``"mot"``, ``"mot_zip"``, ``"coco"``,
         ``"coco_results"`` or ``"yolo"``; None chooses by suffix and content.
@@ -476,8 +363,9 @@ def read_labels(
     KITTI's ``DontCare`` and COCO's crowds become regions; trams, trailers and the like become ignored boxes,
     as do KITTI's vehicles that are largely hidden, truncated by more than 0.7 or narrower than 40 px, the
     same rule as in the project's labels. Persons are left out. Other classes become ignored boxes in KITTI,
-    and are left out elsewhere. A MOT file with nine columns is ground truth, whose rows with flag 0 are
-    ignored; in others column seven is the score.
+    and are left out elsewhere. A MOT file is ground truth if all rows end with a flag (0: ignored), a
+    class and a visible fraction; in others column seven is the score. Occlusion and tracks may stand among
+    COCO's ``attributes``, as CVAT writes them.
 
     Examples
     --------
@@ -503,11 +391,11 @@ def read_labels(
     if classes is not None:
         chosen = frozenset(str(name).lower() for name in check_sequence(classes, "classes", "names"))
     if kind in ("coco", "coco_results"):  # told apart by their content
-        found = _rows_of_records(
+        found = rows_of_records(
             *read_coco(source, chosen, None if truth is None else check_path(truth, "truth"))
         )
     elif kind == "yolo":
-        found, shape = _read_yolo(source, chosen, shape, pictures), None  # its boxes are clipped
+        found, shape = read_yolo(source, chosen, shape, pictures), None  # its boxes are clipped
     else:
         found = _READERS[kind](source, chosen)
     return _table_of(source, found, chosen, shape)
@@ -548,18 +436,34 @@ def _table_of(
 def _guess_format(source: Path) -> str:
     """Choose the format by the suffix or else by the first line."""
     if source.is_dir():
-        named = ("labels", "data.yaml", "classes.txt")
+        named = ("labels", "data.yaml", "classes.txt", "obj.names")
         if any((source / name).exists() for name in named):
             return "yolo"
-        lines = (line for file in source.glob("*.txt") for _, line in _read_lines(file))
-        return "yolo" if 5 <= len(next(lines, "").split()) <= 7 else "kitti"
+        for suffix, tool in ((".xml", "Pascal VOC"), (".json", "a tool with a file for each image")):
+            if any(source.glob(f"*{suffix}")) and not any(source.glob("*.txt")):
+                raise DatasetError(
+                    f"{source} holds {suffix} files, as of {tool}, which are not read; export one COCO file"
+                )
+        lines = (line for file in source.glob("*.txt") for _, line in read_lines(file))
+        words = next(lines, "").split()
+        outlines = len(words) > 8 and not any(word.isalpha() for word in words)  # of YOLO
+        return "yolo" if 5 <= len(words) <= 7 or outlines else "kitti"
     suffix = source.suffix.lower()
+    if suffix in (".yaml", ".yml"):
+        raise DatasetError(f"{source} names a YOLO data set; pass its folder of labels, such as labels/train")
     if suffix == ".tsv" or (suffix in FORMATS and suffix != ".txt"):
         return FORMATS.get(suffix, "csv")
     start = read_text(source).lstrip()[:4096]
     words = _split_words(start.splitlines()[0]) if start else []
     if start.startswith(("{", "[")):
         return "coco"
+    if start.startswith("<"):
+        raise DatasetError(
+            f"{source} is XML, as of CVAT or Pascal VOC, which is not read; export COCO, or from CVAT also "
+            "YOLO 1.1 or MOT 1.1"
+        )
+    if len(words) in (17, 18) and words[2].isalpha():
+        return "kitti"
     if not words or re.fullmatch(r"[0-9]+(\.0*)?", words[0]):
         return "mot"
     return "kitti" if len(words) >= 15 and "frame" not in words else "csv"

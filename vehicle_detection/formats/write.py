@@ -38,7 +38,8 @@ from vehicle_detection.formats.coco import (
     read_truth,
     without_noise,
 )
-from vehicle_detection.formats.read import FOLDER_FORMATS, FORMATS, FRAME_NUMBER, without_suffix
+from vehicle_detection.formats.read import FOLDER_FORMATS, FORMATS
+from vehicle_detection.formats.rows import FRAME_NUMBER, without_suffix
 from vehicle_detection.tables import BOX_COLUMNS, CORNERS, NO_TRACK, TRACK_COLUMNS, FrameKey, TrackTable
 from vehicle_detection.tracking import is_result, shown_tracks
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, check_type, describe
-from vehicle_detection.datasets import load_frames
+from vehicle_detection.datasets import FrameSet, load_frames
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, match_names
 from vehicle_detection.formats import read_labels
@@ -120,13 +120,17 @@ def _read_frames(root: Path, file: Path, clip_rate: float) -> LabelledFrames:
     for folder in folders:
         if folder.is_dir():
             found = LabelledFrames(name, load_frames(folder), labels)
-            named = match_names(labels, found.keys, ("labels", "frames")).frame_keys
-            absent = sorted(set(named) - set(found.keys), key=str)
+            named = set(match_names(labels, found.keys, ("labels", "frames")).frame_keys)
+            absent, unlabelled = sorted(named - set(found.keys), key=str), set(found.keys) - named
             if absent:
+                # A label may be that of an image with another name, which would count as an empty frame.
                 log.warning(
-                    "%s: %d of %d labelled frames have no image in %s, such as %r; they are left out",
-                    *(file, len(absent), len(named), folder, absent[0]),
+                    "%s: %d of %d labelled frames have no image in %s, such as %r; they are left out, and so "
+                    "are %d images without labels",
+                    *(file, len(absent), len(named), folder, absent[0], len(unlabelled)),
                 )
+                kept = tuple(key for key in found.keys if key in named)
+                return LabelledFrames(name, FrameSet(folder, kept), labels)
             return found
     videos = [path for path in (root / "videos").glob(f"{glob.escape(name)}.*") if is_video_file(path)]
     if videos:

@@ -1,0 +1,140 @@
+"""Files as the tools of today write them."""
+
+import json
+
+import pytest
+
+from vehicle_detection import read_labels
+from vehicle_detection.errors import DatasetError
+
+COCO = {
+    "images": [{"id": 1, "file_name": "a.jpg"}, {"id": 2, "file_name": "b.jpg"}],
+    "categories": [{"id": 1, "name": "Car", "supercategory": ""}],
+}
+BOX = {"image_id": 1, "category_id": 1, "bbox": [10, 20, 30, 40], "area": 1200, "segmentation": []}
+
+
+def coco(tmp_path, **values):
+    path = tmp_path / "instances_default.json"
+    path.write_text(json.dumps(COCO | {"annotations": [{"id": 1} | BOX | values]}))
+    return read_labels(path)
+
+
+@pytest.mark.parametrize(
+    ("values", "track", "occluded"),
+    [
+        pytest.param({"attributes": {"track_id": 3, "occluded": True, "keyframe": True}}, 3, 1, id="CVAT"),
+        pytest.param({"attributes": {"occluded": False}}, -1, 0, id="CVAT, shapes"),
+        pytest.param({"instance_id": 4, "occluded": True}, 4, 1, id="MMTracking"),
+        pytest.param({"track_id": 5, "attributes": {"track_id": 3}}, 5, 0, id="both"),
+        pytest.param({"track_id": None, "attributes": []}, -1, 0, id="none"),
+    ],
+)
+def test_tracks_and_occlusion_in_coco(values, track, occluded, tmp_path):
+    table = coco(tmp_path, **values)
+    assert (table["track_id"].tolist(), table["occluded"].tolist()) == ([track], [occluded])
+    assert table.boxes.tolist() == [[10, 20, 40, 60]]
+
+
+MOT_LABELS = {
+    "MOT17": "1,1,11,21,30,40,1,3,0.8\n1,2,11,21,30,40,0,3,1",
+    "spaces": "1 1 11 21 30 40 1 3 0.8\n1 2 11 21 30 40 0 3 1",
+    "CVAT": "1,1,11,21,30,40,1,1,1.0\n1,2,11,21,30,40,0,1,1.0",
+}
+MOT_RESULTS = {
+    "MOT": "1,1,11,21,30,40,0.9\n1,2,11,21,30,40,0.2",
+    "eight": "1,1,11,21,30,40,0.9,2\n1,2,11,21,30,40,0.2,2",
+    "BoxMOT": "1,1,11,21,30,40,0.9,2,-1\n1,2,11,21,30,40,0.2,2,-1",
+    "BoxMOT with a confidence of 1": "1,1,11,21,30,40,0.9,2,-1\n1,2,11,21,30,40,0.2,2,-1",
+    "TrackEval": "1,1,11,21,30,40,0.9,-1,-1,-1\n1,2,11,21,30,40,0.2,-1,-1,-1",
+    "CRLF and BOM": "\ufeff1,1,11,21,30,40,0.9,-1,-1,-1\r\n1,2,11,21,30,40,0.2,-1,-1,-1\r\n",
+}
+
+
+@pytest.mark.parametrize("text", MOT_LABELS.values(), ids=MOT_LABELS)
+def test_labels_of_mot(text, tmp_path):
+    (tmp_path / "gt.txt").write_text(text)
+    table = read_labels(tmp_path / "gt.txt")
+    assert "score" not in table.columns
+    assert table["ignore"].tolist() == [False, True]
+    assert table.boxes[0].tolist() == [10, 20, 40, 60]
+
+
+@pytest.mark.parametrize("text", MOT_RESULTS.values(), ids=MOT_RESULTS)
+def test_results_of_mot(text, tmp_path):
+    (tmp_path / "a.txt").write_text(text, newline="")
+    table = read_labels(tmp_path / "a.txt")
+    assert table["score"].tolist() == [0.9, 0.2]
+    assert (table["frame"].tolist(), table["ignore"].tolist()) == ([0, 0], [False, False])
+
+
+@pytest.mark.parametrize(("flag", "visibility"), [("0", "-1"), ("1", "-1"), ("0.0", "7")])
+def test_nine_columns_that_are_no_labels_are_not_ignored(flag, visibility, tmp_path):
+    (tmp_path / "a.txt").write_text(f"1 1 110 200 100 50 {flag} 2 {visibility}")
+    assert read_labels(tmp_path / "a.txt")["score"].tolist() == [float(flag)]
+
+
+def test_classes_of_results_with_nine_columns(tmp_path):
+    (tmp_path / "a.txt").write_text("1,1,11,21,30,40,0.9,2,-1\n1,2,11,21,30,40,0.2,0,-1")
+    assert read_labels(tmp_path / "a.txt", classes=["2"])["score"].tolist() == [0.9]
+
+
+def test_labels_of_kitti_tracking(tmp_path):
+    rest = "0 0 -1.57 10 20 90 60 1.5 1.6 4 1 2 30 -1.5"
+    text = f"0 3 Car {rest}\n0 -1 DontCare {rest}\n2 3 Van {rest}\n2 5 Cyclist {rest}\n2 7 Tram {rest}\n"
+    (tmp_path / "0001.txt").write_text(text)
+    table = read_labels(tmp_path / "0001.txt")
+    assert (table["frame"].tolist(), table["track_id"].tolist()) == ([0, 0, 2, 2], [3, -1, 3, 7])
+    assert table["ignore"].tolist() == [False, True, False, True]
+    assert len(read_labels(tmp_path)) == 4
+    (tmp_path / "0002.txt").write_text(text)
+    with pytest.raises(DatasetError, match="several drives; name one"):
+        read_labels(tmp_path)
+
+
+def test_yolo_of_cvat(tmp_path):
+    folder = tmp_path / "obj_train_data"
+    folder.mkdir()
+    for name, text in (
+        ("obj.names", "person\r\ncar\r\n"),
+        ("obj.data", "classes = 2"),
+        ("train.txt", "data/a.jpg"),
+    ):
+        (tmp_path / name).write_text(text)
+    (folder / "frame_000000.txt").write_text("1 0.5 0.5 0.2 0.4\n0 0.5 0.5 0.1 0.1\n")
+    (folder / "frame_000001.txt").write_text("")
+    for path in (tmp_path, folder):
+        table = read_labels(path, shape=(100, 200))
+        assert table.boxes.tolist() == [[80, 30, 120, 70]]
+        assert table.frame_keys == ("frame_000000", "frame_000001")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.json", {"shapes": [], "imagePath": "a.jpg"}, "Labelme or X-AnyLabeling, .* export COCO"),
+        ("a.json", [{"name": "a", "labels": []}], "BDD100K"),
+        ("a.json", [{"id": 1, "data": {"image": "a.jpg"}, "annotations": []}], "Label Studio"),
+        ("a.json", [{"image": "a.jpg", "annotator": 1, "label": []}], "Label Studio"),
+        ("a.json", {"a.jpg12": {"filename": "a.jpg", "regions": []}}, "VGG Image Annotator"),
+        ("a.json", {"info": {}, "categories": {}, "items": []}, "Datumaro"),
+        ("a.json", {}, "lacks the lists images, annotations, categories"),
+        ("a.xml", "<?xml version='1.0'?><annotations/>", "CVAT or Pascal VOC, .* export COCO"),
+        ("data.yaml", "names: [car]", "pass its folder of labels"),
+        ("labels/a.txt", "0 .1 .1 .2 .1 .2 .2 .1 .2", "found 9 values; export boxes"),
+        ("labels/a.txt", "0 .5 .5 .2 .2 7", "save_conf=True"),
+    ],
+)  # fmt: skip
+def test_other_formats_are_named(name, text, message, tmp_path):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text if isinstance(text, str) else json.dumps(text))
+    with pytest.raises(DatasetError, match=message):
+        read_labels(path.parent if path.parent != tmp_path else path, shape=(100, 200))
+
+
+@pytest.mark.parametrize(("name", "tool"), [("a.xml", "Pascal VOC"), ("a.json", "a file for each image")])
+def test_folders_of_other_formats_are_named(name, tool, tmp_path):
+    (tmp_path / name).write_text("")
+    with pytest.raises(DatasetError, match=f"{tool}, which are not read; export one COCO file"):
+        read_labels(tmp_path)

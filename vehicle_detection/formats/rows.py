@@ -1,0 +1,62 @@
+"""What the readers of all formats share: the rows of a file, and its lines."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+from vehicle_detection._common import Limit, read_regular_file
+from vehicle_detection.datasets import is_image
+from vehicle_detection.errors import DatasetError
+from vehicle_detection.tables import BOX_COLUMNS, FrameKey
+
+Record = dict[str, Any]
+"""Values of a row by the names of their columns, None where a value is unknown."""
+
+FRAME_NUMBER = re.compile(r"-?(0|[1-9][0-9]{0,17})(\.0*)?")
+"""Text of a frame that is a number. One with leading zeros is a file name."""
+
+
+class FileRows(NamedTuple):
+    """Rows of a file."""
+
+    places: list[str]  # file and line of each, for messages
+    cells: dict[str, list[Any]]  # of each column
+    frames: Sequence[FrameKey] = ()  # that the file lists; they may have no row
+
+
+def rows_of_records(rows: Iterable[tuple[str, Record]], frames: Sequence[FrameKey] = ()) -> FileRows:
+    """Collect records; a cell that a record lacks is missing."""
+    places, records = zip(*listed) if (listed := list(rows)) else ((), ())
+    names = dict.fromkeys(name for record in records for name in record) or BOX_COLUMNS[:-1]
+    return FileRows(list(places), {name: [record.get(name) for record in records] for name in names}, frames)
+
+
+def read_lines(file: Path, text: str | None = None) -> Iterator[tuple[str, str]]:
+    """Yield the lines of a file, or of a text in it, that are not blank, after their places for messages."""
+    for number, line in enumerate((read_text(file) if text is None else text).splitlines(), 1):
+        if line.strip(", \t"):
+            yield f"{file} line {number}", line.strip()
+
+
+def read_text(file: Path) -> str:
+    """Read a file of UTF-8 text of limited size."""
+    try:
+        return read_regular_file(file, str(file), Limit.TEXT_BYTES, error=DatasetError).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise DatasetError(f"{file} is not UTF-8 text; save it as UTF-8") from None
+
+
+def without_suffix(name: str) -> str:
+    """Return the name of a frame without the suffix of an image."""
+    path = PurePosixPath(name)
+    return name[: -len(path.suffix)] if is_image(path.name) else name
+
+
+def no_text_files(folder: Path, expected: str) -> DatasetError:
+    """Error of a folder without text files, which names a subfolder that has some, such as labels/train."""
+    inside = min((file.parent for file in folder.glob("*/*.txt")), default=None)
+    remedy = f"name {expected}" if inside is None else f"its subfolders are read one at a time: name {inside}"
+    return DatasetError(f"{folder} holds no .txt file; {remedy}")
