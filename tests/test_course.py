@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import warnings
 from types import SimpleNamespace
 
 import cv2
@@ -22,8 +23,13 @@ import vehicle_detection.course as lesson
 from tests import lesson_reference as reference
 from vehicle_detection import Detections, read_image, write_image
 from vehicle_detection.course import search as search_module
+from vehicle_detection.course.versions import lesson_defaults
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes import render_patches, render_scene
+from vehicle_detection.svm import UNIT_CHANNELS
+
+# Many tests use images of 0-1 with the lesson's default range of histograms.
+pytestmark = pytest.mark.filterwarnings("ignore:the image has values 0-1, which")
 
 # The kernels compute HOG in float32, scikit-image in float64: values up to 1.
 HOG_TOLERANCE = 5e-6
@@ -210,7 +216,7 @@ def test_files_are_read_as_in_the_lesson(files, suffix):
     if suffix == "png":
         as_bytes = lesson.extract_features(names, "YCrCb", imread=read_image)
         np.testing.assert_array_equal(as_bytes, lesson.extract_features(PATCHES[::20], "YCrCb"))
-    mixed = lesson.extract_features([names[0], reference.read(names[1])], "YCrCb")
+    mixed = lesson.extract_features([names[0], reference.read_file(names[1])], "YCrCb")
     np.testing.assert_array_equal(mixed, found[:2])
 
 
@@ -231,8 +237,9 @@ def test_cspace_selects_the_features_of_the_earlier_quizzes():
 
 @pytest.fixture
 def restored_defaults():
+    before = dict(lesson_defaults)
     yield
-    lesson.set_lesson_defaults(transform_sqrt=False, formula="old")
+    lesson_defaults.update(before)
 
 
 @pytest.mark.usefixtures("restored_defaults")
@@ -476,24 +483,37 @@ def test_a_mismatch_of_the_range_of_values_warns(space):
             lesson.find_cars(*band, color_space=space, divide_by=divide_by)
 
 
-UNIT_SPACES = ["RGB", "YUV", "YCrCb", "HSV", "HLS"]
+UNIT_SPACES = list(UNIT_CHANNELS)
 
 
-@pytest.mark.parametrize("spatial_feat", [False, True])
+@pytest.mark.filterwarnings("ignore:the scaler was fitted")
 @pytest.mark.parametrize("color_space", UNIT_SPACES)
-def test_histograms_of_another_range_warn(color_space, spatial_feat):
+def test_histograms_of_another_range_warn(color_space):
     """With ``hist_range=(0, 256)``, a 0-1 image fills the first bins only."""
-    options = {"color_space": color_space, "spatial_size": (8, 8), "spatial_feat": spatial_feat}
-    # None is the range of the HOG sub-sampling quiz.
-    for images, hist_range in ((PATCHES / np.float32(255), None), (PATCHES, (0, 256))):
-        model = trained(np.array(lesson.extract_features(images, **options, hist_range=hist_range)))
-        with pytest.warns(UserWarning, match="scaler was fitted on") as caught:
-            lesson.search_windows(FRAMES["0-1"], PAIRS, *model, **options)
-        message = str(caught[0].message)
-        assert "divide_by=1" in message
-        assert 'needs hist_range=None and spatial_order="channels"' in message
-        many_bins = "histograms with values in many bins, but all values of a 0-1 image are in the first bin"
-        assert (many_bins in message) or (spatial_feat and hist_range is not None)
+    options = {"color_space": color_space, "spatial_size": (8, 8)}
+    model = trained(np.array(lesson.extract_features(PATCHES, **options)))
+    image, unit = FRAMES["uint8"], FRAMES["0-1"]
+    calls = {
+        "extraction": lambda hist: lesson.extract_features(PATCHES[:2] / 255, **options, hist_range=hist),
+        "one image": lambda hist: lesson.single_img_features(unit, **options, hist_range=hist),
+        "windows": lambda hist: lesson.search_windows(unit, PAIRS, *model, **options, hist_range=hist),
+        "band": lambda hist: lesson.find_cars(
+            image, 60, 200, 1, *model, 9, 8, 2, (8, 8), 32, color_space=color_space, hog_channel=0,
+            hist_range=hist,
+        ),
+    }  # fmt: skip
+    if len(UNIT_CHANNELS[color_space]) == 3:
+        calls["histogram"] = lambda hist: lesson.color_hist(unit, 32, hist)
+    for name, call in calls.items():
+        with pytest.warns(
+            UserWarning, match=r'in the first bin .*0-256.*imread="cv2".*divide_by=1'
+        ) as caught:
+            call((0, 256))
+        assert {warning.filename for warning in caught} == {__file__}, name
+        with warnings.catch_warnings(record=True) as caught:
+            call((0, 1))
+            call(None)
+        assert not [each for each in caught if "first bin" in str(each.message)], name
 
 
 @pytest.mark.parametrize("hist_bins", [1, 2, 16, 256])
@@ -507,7 +527,7 @@ def test_images_like_those_of_the_training_do_not_warn(color_space, spatial_feat
         return  # OpenCV defines them for 0-1
     options = {"color_space": color_space, "spatial_size": (8, 8), "spatial_feat": spatial_feat}
     options |= {"hist_bins": hist_bins, "hog_feat": hist_bins == 1}
-    for hist_range in ((0, 256), (0, 1), None):
+    for hist_range in ((0, 256), (0, 1), None)[dtype == "0-1" :]:
         options["hist_range"] = hist_range
         model = trained(np.array(lesson.extract_features(images, **options)), clf=DummyClassifier())
         lesson.search_windows(FRAMES[dtype], PAIRS, *model, **options)
@@ -584,7 +604,7 @@ def test_boxes_in_every_form():
 
 
 SIGNATURES = {
-    "get_hog_features": "img, orient, pix_per_cell, cell_per_block, vis=False, feature_vec=True",
+    "get_hog_features": "img, orient=9, pix_per_cell=8, cell_per_block=2, vis=False, feature_vec=True",
     "bin_spatial": "img, size=(32, 32)",
     "color_hist": "img, nbins=32, bins_range=(0, 256)",
     "extract_features": "imgs, color_space='RGB', spatial_size=(32, 32), hist_bins=32, orient=9, "
@@ -621,7 +641,8 @@ def test_the_signature_is_the_lessons(name):
 def test_a_star_import_brings_the_lesson_functions():
     names = {}
     exec("from vehicle_detection.course import *", names)
-    functions = set(SIGNATURES) | {"find_car_windows", "HeatmapDetector", "set_lesson_defaults"}
+    functions = set(lesson.__all__) - {"np", "cv2", "mpimg", "hog"}
+    assert set(SIGNATURES) < functions
     modules = {"np": "numpy", "cv2": "cv2", "mpimg": "matplotlib.image", "hog": "skimage.feature._hog"}
     assert functions | set(modules) == set(names) - {"__builtins__"}
     for name, module in modules.items():

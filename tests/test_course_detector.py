@@ -1,22 +1,33 @@
+from collections import deque
+
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from scipy.ndimage import label
 from sklearn.naive_bayes import GaussianNB
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
 import vehicle_detection.course as lesson
 from tests.helpers import rendered_patches
-from tests.video.clips import write_clip
-from vehicle_detection.course import HeatmapDetector, extract_features, find_car_windows
+from vehicle_detection import detector_from, load_classifier
+from vehicle_detection.course import (
+    Box,
+    BoxSmoother,
+    HeatmapDetector,
+    adjust_bbox,
+    extract_features,
+    find_car_windows,
+    process_image,
+    reference,
+)
+from vehicle_detection.course.versions import lesson_defaults
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, evaluate_detections
 from vehicle_detection.formats import read_labels
 from vehicle_detection.scenes import render_scene
 from vehicle_detection.tables import TrackTable
-from vehicle_detection.video import process_video
 
 FEATURES = {"spatial_size": (16, 16), "hist_bins": 16, "divide_by": 1}
 
@@ -34,98 +45,154 @@ def estimators(request, patches):
     return request.param.fit(scaler.transform(X), labels), scaler
 
 
+@pytest.fixture(scope="module")
+def scene():
+    return cv2.resize(render_scene(shape=(540, 960), random_state=3).image, (1280, 720))
+
+
 def frame_of(patches, shift=0):
     frame = np.full((360, 640, 3), 90, np.uint8)
     frame[210:274, 300 + shift : 364 + shift] = patches[0][0]
     return frame
 
 
-def lesson_boxes(heats, threshold):
-    """Boxes of the lesson: labels of the mean heat above the threshold."""
-    heat = lesson.apply_threshold(np.mean(heats, axis=0), threshold)
-    array, count = label(heat, structure=np.ones((3, 3)))
-    return [
-        [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
-        for rows, columns in (np.nonzero(array == number) for number in range(1, count + 1))
-    ]
-
-
-def test_it_takes_the_steps_of_the_lesson(estimators, patches):
-    svc, scaler = estimators
-    detector = HeatmapDetector(svc, scaler, threshold=1, n_frames=3, **FEATURES)
-    heats = []
+def test_it_takes_the_steps_of_the_reference(estimators, patches):
+    detector = HeatmapDetector(*estimators, threshold=1, n_frames=3, **FEATURES)
+    history = deque(maxlen=3)
     for shift in range(0, 12, 2):
         frame = frame_of(patches, shift)
         hits = [
             box
             for scale in (0.8, 1.0, 1.5)
             for box in find_car_windows(
-                frame, 200, 328, scale / 2, svc, scaler, 9, 8, 2, (16, 16), 16, divide_by=1
+                frame, 200, 328, scale / 2, *estimators, 9, 8, 2, (16, 16), 16, divide_by=1
             )
         ]
-        heats = [*heats[-2:], lesson.add_heat(np.zeros(frame.shape[:2]), hits)]
-        result = detector.process(frame)
-        np.testing.assert_array_equal(result.windows.boxes, np.array(hits, float).reshape(-1, 4))
-        np.testing.assert_allclose(detector.heatmap, np.mean(heats, axis=0), rtol=1e-6)
-        expected = lesson_boxes(heats, 1)
-        assert sorted(result.detections.boxes.tolist()) == sorted(map(list, expected))
-        assert detector.labels[1] == len(expected)
-    assert hits
+        np.testing.assert_array_equal(detector(frame), reference.process_frame(frame, hits, history, 1))
+        assert detector.windows == hits != []
+        assert reference.labeled_bboxes(detector.labels)
+
+
+def test_scales_have_rows_and_columns_of_their_own(estimators, patches):
+    bands = [(0.5, (400, 656)), (0.75, (420, 560), (560, 760))]
+    hits = HeatmapDetector(*estimators, scales=bands, **FEATURES)
+    plain = HeatmapDetector(*estimators, scales=[0.5], **FEATURES)
+    frame = frame_of(patches)
+    for detector in (hits, plain):
+        detector(frame)
+    assert hits.windows[: len(plain.windows)] == plain.windows
+    for (x1, y1), (x2, y2) in hits.windows[len(plain.windows) :]:
+        assert 280 <= x1 < x2 <= 380
+        assert 210 <= y1 < y2 <= 280
+    highway = HeatmapDetector(scales=[(1.0, (400, 500), (640, 1280))])
+    assert all(x1 >= 639 for x1, *_ in highway.find_windows(np.zeros((720, 1280, 3), np.uint8)))
+
+
+def test_both_methods_find_the_vehicles_of_a_scene(scene, estimators):
+    for method in (1, 2):
+        detector = HeatmapDetector(method=method)
+        drawn = process_image(scene, method=method)
+        np.testing.assert_array_equal(drawn, detector(scene))
+        assert detector.labels[1] > 0
+    own = HeatmapDetector(*estimators, method=1, **FEATURES)
+    own(scene)
+    windows = [((x1, y1), (x2, y2)) for x1, y1, x2, y2 in own.windows]
+    everything = HeatmapDetector(*estimators, method=1, threshold=0, **FEATURES)
+    everything(np.zeros((720, 1280, 3), np.uint8))
+    options = {"color_space": "YCrCb", "hog_channel": "ALL", "spatial_size": (16, 16), "hist_bins": 16}
+    assert windows == lesson.search_windows(scene, windows, *estimators, **options)
+
+
+def test_any_function_finds_the_windows(scene):
+    detector = HeatmapDetector(lambda image: [((10, 20), (50, 60)), ((20, 20), (60, 60))], threshold=1)
+    assert detector.find_cars(scene) == [((20, 20), (49, 59))]
+    assert detector.detect(scene).boxes.tolist() == [[20, 20, 50, 60]]
+    assert detector.detect(scene).scores.tolist() == [2]
+    with detector_from(detector.detect, score=(1, 4)) as tracked:
+        assert tracked.detect(scene).boxes.tolist() == [[20, 20, 50, 60]]
+
+
+def test_a_frame_of_another_size_starts_anew(scene):
+    detector = HeatmapDetector(lambda image: [((10, 20), (50, 60))], threshold=0)
+    for frame in (scene, scene, scene[:360, :640]):
+        detector(frame)
+    assert len(detector.history) == 1
+    assert detector.heatmap.shape == (360, 640)
 
 
 def test_it_keeps_the_defaults_of_its_construction(estimators):
     frame = render_scene(shape=(360, 640), random_state=3).image
+    before = dict(lesson_defaults)
     try:
         lesson.set_lesson_defaults(transform_sqrt=True)
         detector = HeatmapDetector(*estimators, threshold=1, **FEATURES)
     finally:
-        lesson.set_lesson_defaults(transform_sqrt=False)
+        lesson_defaults.update(before)
     told, plain = (
         HeatmapDetector(*estimators, threshold=1, **FEATURES, transform_sqrt=value) for value in (True, False)
     )
-    found, expected, other = (each.process(frame).windows.boxes for each in (detector, told, plain))
-    np.testing.assert_array_equal(found, expected)
-    assert found.tolist() != other.tolist() or isinstance(estimators[0], GaussianNB)
+    found, expected, other = (each.find_windows(frame) for each in (detector, told, plain))
+    assert found == expected
+    assert found != other or isinstance(estimators[0], GaussianNB)
 
 
-def test_calling_it_draws_in_the_style_of_the_course(tmp_path):
-    scene = render_scene(shape=(540, 960), random_state=3)
-    frame = cv2.resize(scene.image, (1280, 720))
+def test_a_single_image_is_shown_with_its_steps(scene):
+    plt.close("all")
     detector = HeatmapDetector()
-    assert detector.heatmap is None
-    with pytest.raises(InvalidInputError, match="labels need a frame"):
-        _ = detector.labels
-    drawn = detector(frame)
-    boxes = detector.detect(frame).boxes
-    assert len(boxes)
-    np.testing.assert_array_equal(drawn, lesson.draw_boxes(frame, boxes))
-    labels = detector.labels
-    assert labels[0].shape == frame.shape[:2]
-    assert labels[1] == len(boxes)
-    assert detector.heatmap.shape == (720, 1280)
-    detector.reset()
-    assert detector.heatmap is None
-    clip = write_clip(tmp_path / "clip.mp4", [scene.image] * 6, fps="25")
-    assert process_video(clip, tmp_path / "out.mp4", detector).frames == 6
+    drawn = detector(scene, test=True)
+    assert [panel.get_title() for panel in plt.gcf().axes] == ["windows", "heat", "labels", "boxes"]
+    assert [np.shape(panel.images[0].get_array()) for panel in plt.gcf().axes[1:3]] == [(720, 1280)] * 2
+    plt.close("all")
+    assert not detector.history
+    np.testing.assert_array_equal(drawn, detector(scene))
+    assert (drawn != scene).any()
 
 
-def test_the_threshold_fits_the_density():
-    sparse, dense = HeatmapDetector(), HeatmapDetector(cells_per_step=1)
-    assert dense.detector.region_params.threshold == pytest.approx(
-        4 * sparse.detector.region_params.threshold
+BOX, MOVED = ((0, 0), (40, 40)), ((10, 0), (50, 40))
+
+
+@pytest.mark.parametrize(
+    ("options", "frames", "expected"),
+    [
+        ({}, [[BOX], [MOVED], []], [[BOX], [MOVED], []]),
+        ({"weight": 0.5}, [[BOX], [MOVED]], [[BOX], [((5, 0), (45, 40))]]),
+        ({"hold": 2}, [[BOX], [], [], []], [[BOX], [BOX], [BOX], []]),
+        ({"show_after": 2}, [[BOX], [MOVED], [MOVED]], [[], [MOVED], [MOVED]]),
+        (
+            {"hold": 9, "estimate": True},
+            [[BOX], [MOVED], [], [((30, 0), (70, 40))], []],
+            [[BOX], [MOVED], [((20, 0), (60, 40))], [((30, 0), (70, 40))], [((40, 0), (80, 40))]],
+        ),
+        ({"hold": 1}, [[BOX], [((90, 0), (130, 40))]], [[BOX], [((90, 0), (130, 40)), BOX]]),
+    ],
+)
+def test_boxes_are_smoothed(options, frames, expected):
+    smoother = BoxSmoother(**options)
+    assert [smoother(boxes) for boxes in frames] == expected
+
+
+def test_the_detector_smooths_its_boxes(scene):
+    boxes = iter([[BOX], []])
+    detector = HeatmapDetector(
+        lambda image: next(boxes), threshold=0, n_frames=1, smoother=BoxSmoother(hold=1)
     )
-    assert sparse.detector.region_params.threshold == pytest.approx(2, abs=0.2)
-    with pytest.warns(UserWarning, match="the heat threshold 40 does not fit the density"):
-        HeatmapDetector(threshold=40)
+    assert [detector.find_cars(scene) for _ in range(2)] == [[((0, 0), (39, 39))]] * 2
+
+
+def test_newer_boxes_weigh_more():
+    box = Box(n=3)
+    shown = [box.add(((x, 0), (x + 40, 40))) for x in (0, 30, 60, 60)]
+    assert [x for (x, _), _ in shown] == [0, 20, 40, 55]
+    assert adjust_bbox(MOVED, BOX, weight=0.3) == ((3, 0), (43, 40))
 
 
 @pytest.mark.realdata
-def test_it_finds_all_vehicles_of_the_courses_images(real_data):
+def test_it_finds_the_vehicles_of_the_courses_images(real_data):
     labels = read_labels(real_data / "labels" / "test_images.csv")
     images = LabelledFrames("test images", load_frames(real_data / "test_images"), labels)
-    with HeatmapDetector() as detector:
-        found = TrackTable.from_detections({key: detector.detect(image) for key, image in images})
-    scores = evaluate_detections(found, images.labels, frames=images.keys)
+    detector = HeatmapDetector()
+    table = TrackTable.from_detections({key: detector.detect(image) for key, image in images})
+    scores = evaluate_detections(table, images.labels, frames=images.keys)
     assert (scores.tp, scores.fn, scores.fp) == (9, 0, 0)
 
 
@@ -136,13 +203,15 @@ def test_it_finds_all_vehicles_of_the_courses_images(real_data):
         ({"orient": 9}, r"must be omitted with a model of the library, .*'orient'"),
         ({"clf": LinearSVC()}, "or a fitted classifier with a scaler; got LinearSVC"),
         ({"clf": None}, "clf must be a model of the library"),
-        ({"ystart": -1}, "ystart must be an integer"),
-        ({"ystop": 400}, "ystop must be an integer at least 401"),
-        ({"scales": 1.5}, "scales must be a sequence of numbers"),
+        ({"scales": 1.5}, "scales must be"),
         ({"scales": (0,)}, "scales must be a number"),
+        ({"ystart": -1}, "scales must hold"),
+        ({"ystop": 400}, "scales must hold"),
+        ({"scales": [(1.0, 400, 656)]}, "scales must hold"),
         ({"cells_per_step": 0}, "cells_per_step must be an integer"),
-        ({"n_frames": 0}, "frames must be an integer"),
-        ({"clf": "default"}, "search_params must be a NetworkParams"),
+        ({"n_frames": 0}, "n_frames must be an integer"),
+        ({"threshold": -1}, "threshold must be a number"),
+        ({"method": 3}, "method must be one of 1, 2"),
     ],
 )
 def test_invalid_arguments_are_rejected(arguments, message):
@@ -152,11 +221,18 @@ def test_invalid_arguments_are_rejected(arguments, message):
 
 def test_options_are_checked_before_the_first_frame(estimators):
     with pytest.raises(InvalidInputError, match="fitted on 6108 features, but these options give 8460"):
-        HeatmapDetector(*estimators)
-    # Frames may be searched in other threads, whose warnings name no line of the caller.
+        HeatmapDetector(*estimators, divide_by=1)
     options = {name: value for name, value in FEATURES.items() if name != "divide_by"}
     with pytest.warns(UserWarning, match="divide_by=1") as caught:
         HeatmapDetector(*estimators, **options)
-    assert caught[0].filename == __file__
+    assert {warning.filename for warning in caught} == {__file__}
     with pytest.raises(TypeError, match="spatial"):
         HeatmapDetector(*estimators, **FEATURES, spatial=True)
+
+
+def test_a_model_of_the_library_or_its_file(tmp_path, scene):
+    model = load_classifier()
+    model.save(tmp_path / "model.safetensors")
+    found = [HeatmapDetector(clf)(scene) for clf in (model, tmp_path / "model.safetensors", "highway")]
+    for drawn in found[1:]:
+        np.testing.assert_array_equal(drawn, found[0])

@@ -23,6 +23,8 @@ from tests.helpers import rendered_patches
 from vehicle_detection import write_image
 from vehicle_detection.scenes import render_scene
 
+pytestmark = pytest.mark.filterwarnings("ignore:the image has values 0-1, which")
+
 # The kernels compute HOG in float32, scikit-image in float64: values up to 1.
 FEATURE_TOLERANCE = 5e-6
 
@@ -178,7 +180,7 @@ def system_5(lesson, data):
             )
         return np.concatenate(parts)
 
-    images = [lesson_reference.read(name) for names in data.jpg for name in names]
+    images = [lesson_reference.read_file(name) for names in data.jpg for name in names]
     X = np.array([features_of(image) for image in images])
     y = np.repeat((1, 0), [len(names) for names in data.jpg])
     scaler = StandardScaler().fit(X)

@@ -33,7 +33,7 @@ ALLOWED = {
 HEAVY = {"matplotlib", "moviepy", "sklearn", "pandas", "pooch", "jinja2", "dask", "pyarrow", "motmetrics"}
 HEAVY |= {"ipywidgets", "IPython"}
 # Modules about scikit-learn, themselves imported on first use.
-SKLEARN_MODULES = {"training.pipeline"}
+SKLEARN_MODULES = {"training.pipeline", "course.reference"}
 UNSAFE = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
 
 # Public names without an example in their docstring, and why.

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.helpers import random_classifier
-from vehicle_detection.course.reference import score_windows
+from tests.search_reference import score_windows
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import COLOR_SPACES, FeatureParams
 from vehicle_detection.search import PixelBand, SearchBand, SearchParams, resize_band, resized_shape

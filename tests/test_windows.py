@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import random_classifier
+from tests.search_reference import score_windows
 from vehicle_detection import course
-from vehicle_detection.course.reference import score_windows
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, single_img_features
 from vehicle_detection.search import SearchParams

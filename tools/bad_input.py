@@ -43,7 +43,8 @@ MAX_SECONDS = 60
 """Time limit of one call, which may have to compile kernels."""
 
 NOT_CALLED = {
-    "course.set_lesson_defaults": "changes later calls; tests/test_course.py",
+    "course.set_lesson_defaults": "changes later calls; tests/test_course_versions.py",
+    "course.detect_versions": "takes a module; tests/test_course_versions.py",
     "open_dask": "starts a cluster",
     "write_video": "takes what track returned; tests/video/test_writing.py",
     "fetch_patches": "downloads; its arguments are tested in tests/datasets/test_archives.py",

@@ -425,7 +425,7 @@ def fill_hog_cells(
 class BandFilters:
     """Affine functions of a feature vector, each ``(weights, bias)``, as filters over cells.
 
-    The reference is `course.reference.score_windows`.
+    It equals a feature vector of `course.reference.find_car_windows` times the weights, for each window.
     """
 
     def __init__(self, params: FeatureParams, functions: Sequence[tuple[NDArray[np.float64], float]]) -> None:

@@ -11,8 +11,9 @@ Images are ``(H, W, 3)`` RGB, uint8 or float, as in the lesson; windows and boxe
 a ``StandardScaler``. Everything else takes the lesson's own steps: features, ``scaler.transform``,
 ``clf.predict``. Both ways agree within float32 precision.
 
-The names that ``lesson_functions.py`` imports are here as well: ``np``, ``cv2``, ``mpimg`` and ``hog``.
-The page ``docs/course.md`` lists the differences from the lesson and counterparts in the main API.
+`vehicle_detection.course.reference` is the whole pipeline, to read. The names that ``lesson_functions.py``
+imports are here as well: ``np``, ``cv2``, ``mpimg`` and ``hog``. The page ``docs/course.md`` lists the
+differences from the lesson and counterparts in the main API.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -20,22 +21,26 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from vehicle_detection.course.detector import HeatmapDetector
+from vehicle_detection.course.detector import HeatmapDetector, process_image
 from vehicle_detection.course.features import (
     bin_spatial,
     color_hist,
     convert_color,
     extract_features,
+    extract_features_all,
     get_hog_features,
-    set_lesson_defaults,
     single_img_features,
 )
 from vehicle_detection.course.search import find_car_windows, find_cars, search_windows
+from vehicle_detection.course.smoothing import Box, BoxSmoother, adjust_bbox
+from vehicle_detection.course.versions import detect_versions, set_lesson_defaults
 from vehicle_detection.course.windows import (
     add_heat,
     apply_threshold,
+    bounding_boxes,
     draw_boxes,
     draw_labeled_bboxes,
+    show_images,
     slide_window,
 )
 
@@ -44,24 +49,32 @@ if TYPE_CHECKING:
     from skimage.feature import hog
 
 __all__ = [
+    "Box",
+    "BoxSmoother",
     "HeatmapDetector",
     "add_heat",
+    "adjust_bbox",
     "apply_threshold",
     "bin_spatial",
+    "bounding_boxes",
     "color_hist",
     "convert_color",
     "cv2",
+    "detect_versions",
     "draw_boxes",
     "draw_labeled_bboxes",
     "extract_features",
+    "extract_features_all",
     "find_car_windows",
     "find_cars",
     "get_hog_features",
     "hog",
     "mpimg",
     "np",
+    "process_image",
     "search_windows",
     "set_lesson_defaults",
+    "show_images",
     "single_img_features",
     "slide_window",
 ]

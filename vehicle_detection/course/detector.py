@@ -1,58 +1,68 @@
-"""The course's detector: hits of the window search, their heat over several frames, threshold, labels."""
+"""The course's detector of videos: hot windows, their heat over several frames, threshold, labels, boxes."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+import copy
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import label
 
-from vehicle_detection._common import check_integer, check_number, check_sequence, check_type, describe
-from vehicle_detection.camera import Camera
-from vehicle_detection.course.features import or_default
-from vehicle_detection.course.search import find_car_windows
-from vehicle_detection.course.windows import draw_boxes
-from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import PATCH_SIZE
-from vehicle_detection.function_model import FunctionModel
-from vehicle_detection.heatmap import HeatParams, heat_threshold
-from vehicle_detection.search import REFERENCE_WIDTH, SearchBand, SearchParams
-from vehicle_detection.svm import VehicleClassifier
-from vehicle_detection.tracking import FrameResult
-
-_HORIZON = 400 / 720
+from vehicle_detection._common import check_image, check_integer, check_number
+from vehicle_detection.boxes import Detections
+from vehicle_detection.course.methods import FindWindows, read_bands, window_search
+from vehicle_detection.course.smoothing import BoxSmoother
+from vehicle_detection.course.windows import (
+    Corners,
+    add_heat,
+    apply_threshold,
+    draw_boxes,
+    labeled_bboxes,
+    show_images,
+)
+from vehicle_detection.heatmap import label_boxes
 
 
-class HeatmapDetector(VehicleDetector):
-    """Detect vehicles as in the course: search windows, add up the heat of the hits, threshold, label.
+class HeatmapDetector:
+    """Detect vehicles in the frames of a video as in the course: windows, heat, threshold, labels, boxes.
 
-    A `VehicleDetector` with the course's parameters: calling it with a frame draws the boxes, and
-    `process_video`, `annotate_clip`, `detect` and the evaluation work as usual.
+    Calling it with a frame draws the boxes, as in ``clip.image_transform(detector)`` of moviepy. It keeps the
+    heat of the last frames and nothing else, unless `smoother` does.
 
     Parameters
     ----------
     clf
-        ``"highway"``, the path of a model file, a `VehicleClassifier`, or any fitted classifier with
-        ``predict``, which needs `scaler` unless it is a pipeline.
+        What finds the hot windows: ``"highway"``, the path of a model file, a `VehicleClassifier`; a fitted
+        classifier with ``predict``, which needs `scaler` unless it is a pipeline; or a function of an image
+        that returns boxes.
     scaler
         The fitted scaler with ``transform`` of such a classifier.
-    ystart, ystop, scales
-        Rows to search in a 1280x720 frame, and sides of the windows divided by 64 pixels; they scale with it.
-    cells_per_step
-        Step between windows in cells of 8 pixels.
+    method
+        1: a list of 130 windows, each classified by itself; 2: HOG sub-sampling at several scales.
+    scales
+        Sides of the windows divided by 64 pixels, for method 2, each alone or with its own rows and columns:
+        ``(1.5, (400, 656), (0, 1280))``.
+    ystart, ystop
+        Rows for the other scales. All positions are those of a 1280x720 frame, and scale with it.
     threshold, n_frames
-        A pixel is hot if more than this number of windows hit it, as the mean over so many frames. None:
-        chosen for the density of the windows.
+        A pixel is hot if more than this number of windows hit it, as the mean over so many frames. By default
+        1 for method 1 and 2 for method 2. It fits one density of windows: four times as many windows, as with
+        half the step, need four times the threshold.
+    smoother
+        A `BoxSmoother`, or another function of the boxes of a frame that returns those to show.
     **options
-        For a classifier with `scaler`, the features that it was trained on: arguments of `find_car_windows`
-        such as ``orient`` (default 9), ``pix_per_cell`` (8), ``cell_per_block`` (2), ``spatial_size``
-        ((32, 32)), ``hist_bins`` (32), ``color_space``, ``transform_sqrt`` and ``divide_by``.
+        For method 2, ``cells_per_step``. For a classifier of your own, the features that it was trained on,
+        as in `find_cars` and `search_windows`, by default ``orient=9, pix_per_cell=8, cell_per_block=2,
+        spatial_size=(32, 32), hist_bins=32``, and ``divide_by``.
 
-    A warning says if the threshold cannot fit the density of the windows.
+    Attributes
+    ----------
+    windows, heatmap, labels
+        Of the last frame: hot windows, mean heat above the threshold ``(H, W)``, and what
+        ``scipy.ndimage.label`` returns for it.
 
     Examples
     --------
@@ -67,94 +77,62 @@ class HeatmapDetector(VehicleDetector):
         clf: Any = "highway",
         scaler: Any = None,
         *,
+        method: Literal[1, 2] = 2,
+        scales: Sequence[Any] = (0.8, 1.0, 1.5),
         ystart: int = 400,
         ystop: int = 656,
-        scales: Sequence[float] = (0.8, 1.0, 1.5),
-        cells_per_step: int = 2,
         threshold: float | None = None,
         n_frames: int = 5,
+        smoother: BoxSmoother | Callable[[list[Corners]], Any] | None = None,
         **options: Any,
     ) -> None:
-        scales = check_sequence(scales, "scales", "numbers")
-        search = _search_params(ystart, ystop, scales, cells_per_step)
-        heat = HeatParams(weighting="count", frames=n_frames, threshold=threshold, peak_fraction=0)
-        if isinstance(clf, (str, os.PathLike, VehicleClassifier)):
-            if scaler is not None or options:
-                raise InvalidInputError(
-                    "scaler and options of the features must be omitted with a model of the library, which "
-                    f"contains them; got {describe(scaler)} and {sorted(options)}"
-                )
-            super().__init__(clf, search_params=search, region_params=heat)
-        else:
-            scaled = hasattr(scaler, "transform") or (scaler is None and hasattr(clf, "steps"))
-            if not hasattr(clf, "predict") or not scaled:
-                raise InvalidInputError(
-                    "clf must be a model of the library, or a fitted classifier with a scaler; got "
-                    f"{describe(clf)} and {describe(scaler)}; pass the scaler, or a pipeline of both"
-                )
-            defaults = {"orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "spatial_size": (32, 32)}
-            options = {**defaults, "hist_bins": 32, "cells_per_step": cells_per_step, **options}
-            # Later changes of the default must not change a detector.
-            options["transform_sqrt"] = or_default(options.get("transform_sqrt"), "transform_sqrt")
-            hits = _WindowSearch((ystart, ystop), scales, {"svc": clf, "X_scaler": scaler, **options})
-            # An image of one window checks the options, the estimators and the range before the first frame.
-            white = np.full((PATCH_SIZE, PATCH_SIZE, 3), 255, np.uint8)
-            find_car_windows(white, None, None, 1, **hits.arguments)
-            model = FunctionModel(function=hits, score="logit", thread_safe=True, name="find_car_windows")
-            camera = Camera.dashcam(horizon=_HORIZON)
-            super().__init__(model, region_params=heat.for_search(search), camera=camera)
-        self._warned = True  # the course shows no speeds
+        bands = read_bands(scales, (ystart, ystop))
+        self.find_windows: FindWindows = window_search(clf, scaler, method, bands, options)
+        self.threshold = check_number(float(method) if threshold is None else threshold, "threshold", low=0)
+        self.history: deque[NDArray[Any]] = deque(maxlen=check_integer(n_frames, "n_frames", low=1))
+        self.smoother = smoother
+        self.windows: Any = []
+        self.heatmap: Any = None
+        self.labels: Any = None
 
-    @property
-    def heatmap(self) -> NDArray[np.float32] | None:
-        """Mean number of hits per pixel over the last frames, ``(H, W)``; None before the first frame."""
-        return None if self.heat is None else self.heat.copy()
+    def __call__(self, frame: NDArray[np.uint8], test: bool = False) -> NDArray[np.uint8]:
+        """Draw the vehicles on a copy of the next frame; with `test`, of a single one, and show its steps."""
+        if not test:
+            return draw_boxes(frame, self.find_cars(frame))
+        alone = self.without_history()
+        drawn = alone(frame)
+        steps = draw_boxes(frame, alone.windows), alone.heatmap, alone.labels[0], drawn
+        show_images(steps, ["windows", "heat", "labels", "boxes"])
+        return drawn
 
-    @property
-    def labels(self) -> tuple[NDArray[np.int32], int]:
-        """Label array ``(H, W)`` of the regions above the threshold, and their number."""
-        from scipy.ndimage import label
+    def find_cars(self, frame: NDArray[np.uint8]) -> list[Corners]:
+        """Find the vehicles of the next frame: pairs of corners."""
+        check_image(frame, "frame")
+        self.windows = self.find_windows(frame)
+        heat = add_heat(np.zeros(frame.shape[:2], np.float32), self.windows)
+        if self.history and self.history[-1].shape != heat.shape:
+            self.history.clear()
+        self.history.append(heat)
+        self.heatmap = apply_threshold(np.mean(self.history, axis=0), self.threshold)
+        self.labels = label(self.heatmap)
+        boxes = labeled_bboxes(self.labels)
+        return boxes if self.smoother is None else self.smoother(boxes)
 
-        if self.heat is None or self.detector.heat_params is None:
-            raise InvalidInputError("labels need a frame; call the detector with one first")
-        array, count = label(self.heat > heat_threshold(self.detector.heat_params), structure=np.ones((3, 3)))
-        return array, count
+    def detect(self, image: NDArray[np.uint8]) -> Detections:
+        """Find the vehicles of a single image: half-open boxes, and the highest heat of each as its score."""
+        alone = self.without_history()
+        alone.find_cars(image)
+        return label_boxes(alone.heatmap)
 
-    def annotate(self, frame: NDArray[np.uint8], result: FrameResult) -> NDArray[np.uint8]:
-        """Draw the boxes of the hot regions on a copy of the frame, in the course's style."""
-        if self.annotator.diagnostics:
-            return super().annotate(frame, result)
-        check_type(result, "result", FrameResult, "pass what process or track returns")
-        return draw_boxes(frame, result.detections)
+    def without_history(self) -> HeatmapDetector:
+        """Return a detector with the same settings for a single image."""
+        alone = copy.copy(self)
+        alone.history, alone.smoother = deque(maxlen=1), None
+        return alone
 
 
-def _search_params(ystart: int, ystop: int, scales: Sequence[float], cells_per_step: int) -> SearchParams:
-    """Bands with the windows of the lesson's ``find_cars`` at each scale."""
-    top = check_integer(ystart, "ystart", low=0)
-    bottom = check_integer(ystop, "ystop", low=top + 1)
-    overlap = 1 - check_integer(cells_per_step, "cells_per_step", low=1, high=8) / 8
-    if not len(scales):
-        raise InvalidInputError("scales must hold a number at least, such as (1.0, 1.5); got none")
-    sides = [PATCH_SIZE * check_number(scale, "scales", low=0.25, high=20) for scale in scales]
-    y = (top - 400.0, bottom - 400.0)
-    bands = tuple(SearchBand(window=(side, side), y=y, overlap=(overlap, overlap)) for side in sides)
-    return SearchParams(bands=bands, horizon=_HORIZON)
-
-
-@dataclass(frozen=True, eq=False)
-class _WindowSearch:
-    """The hits of ``find_cars`` at several scales: boxes, and scores of 1."""
-
-    rows: tuple[int, int]
-    scales: tuple[float, ...]
-    arguments: dict[str, Any]
-
-    def __call__(self, image: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[np.float64]]:
-        factor = max(image.shape) / REFERENCE_WIDTH
-        ystart, ystop = (round(row * factor) for row in self.rows)
-        hits = [
-            box
-            for scale in self.scales
-            for box in find_car_windows(image, ystart, ystop, scale * factor, **self.arguments)
-        ]
-        return np.array(hits, np.float64).reshape(-1, 4), np.ones(len(hits))
+def process_image(
+    image: NDArray[np.uint8], *, method: Literal[1, 2] = 2, **options: Any
+) -> NDArray[np.uint8]:
+    """Draw the vehicles of a single image; the options are those of `HeatmapDetector`."""
+    return HeatmapDetector(method=method, **options)(image)

@@ -7,7 +7,7 @@ import functools
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, dataclass
-from typing import Any, Literal, ParamSpec, Self, TypeVar
+from typing import Any, Literal, Self
 
 import cv2
 import numpy as np
@@ -20,7 +20,6 @@ from vehicle_detection._common import (
     check_choice,
     check_flags,
     check_integer,
-    check_number,
     check_type,
     checked_field,
     choice,
@@ -29,20 +28,24 @@ from vehicle_detection._common import (
     is_listing,
 )
 from vehicle_detection._kernels import features as kernels
+from vehicle_detection.course.versions import (
+    CHANNEL_ORDERS,
+    READERS,
+    check_range,
+    check_switch,
+    lesson_function,
+    warn,
+)
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import COLOR_SPACES, PATCH_SIZE, SPATIAL_ORDERS, FeatureParams
 from vehicle_detection.images import read_image
 from vehicle_detection.search import fill_hog_cells
+from vehicle_detection.svm import UNIT_CHANNELS
 
 Image = NDArray[Any]
 Images = list[Image] | NDArray[Any]
 Size = int | Sequence[int]
-SpatialOrder = Literal["interleaved", "channels"]
-Formula = Literal["old", "new"]
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
 
-FORMULAS = ("old", "new")
 # OpenCV's names of the color spaces by their name in upper case.
 _OPENCV_SPACES = {space.upper(): space for space in (*COLOR_SPACES, "BGR", "GRAY")}
 _CHUNK = 4096  # number of images that are read and processed at a time
@@ -52,44 +55,10 @@ _UNUSED: dict[str, dict[str, Any]] = {
     "hist_feat": {"hist_bins": 32, "hist_range": (0, 256)},
     "hog_feat": {"orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "hog_channel": 0},
 }
-_defaults: dict[str, Any] = {"transform_sqrt": False, "formula": "old"}
 _checked: dict[str, FeatureOptions] = {}  # the options of earlier calls
 _MAX_CHECKED = 64
-
-
-def set_lesson_defaults(*, transform_sqrt: bool | None = None, formula: Formula | None = None) -> None:
-    """Set the defaults in which published versions of ``lesson_functions.py`` differ.
-
-    They hold for later calls in this process that do not pass the option; a `HeatmapDetector` keeps those of
-    its construction. None leaves a default as it is.
-
-    Parameters
-    ----------
-    transform_sqrt
-        Default of all functions that compute HOG, initially False. True if your own file calls
-        scikit-image's ``hog`` with ``transform_sqrt=True``, as most published ones do.
-    formula
-        Default of `slide_window`, but not of `find_cars`, initially ``"old"``. ``"new"`` if your own
-        ``slide_window`` computes ``nx_buffer``.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from vehicle_detection.course import slide_window
-    >>> image = np.zeros((64, 128, 3), np.uint8)
-    >>> set_lesson_defaults(formula="new")
-    >>> len(slide_window(image, xy_overlap=(0.5, 0)))
-    3
-    >>> set_lesson_defaults(formula="old")
-    """
-    root, formula = or_default(transform_sqrt, "transform_sqrt"), or_default(formula, "formula")
-    check_choice(formula, "formula", FORMULAS)
-    _defaults.update(transform_sqrt=_check_switch(root, "transform_sqrt"), formula=formula)
-
-
-def or_default(value: Any, name: str) -> Any:
-    """Return an option's value, or its default if it is None."""
-    return _defaults[name] if value is None else value
+# Range of the maximum of images with values 0-1; almost black ones may have either range.
+_UNIT_MAXIMA = (0.1, 2.0)
 
 
 def check_lesson_image(img: Any, name: str = "img", *, drop_alpha: bool = False) -> Image:
@@ -120,23 +89,8 @@ def check_size(size: Any, name: str) -> tuple[int, int]:
     return check_integer(pair[0], name, low=1), check_integer(pair[1], name, low=1)
 
 
-def check_range(limits: Any, name: str) -> tuple[float, float] | None:
-    """Return the range of a histogram; None stands for the range of the values."""
-    if limits is None:
-        return None
-    if check_array(limits, name).shape != (2,):
-        raise InvalidInputError(f"{name} must be (low, high) or None; got {describe(limits)}")
-    low = check_number(limits[0], name)
-    return low, check_number(limits[1], name, above=low)
-
-
-def _check_switch(value: Any, name: str) -> bool:
-    """Return a switch as a bool; the lesson's code also passes 0 and 1."""
-    check_flags(**{name: value})
-    return bool(value)
-
-
-def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
+@lesson_function()
+def convert_color(img: Image, conv: str = "RGB2YCrCb", *, color_space: str | None = None) -> Image:
     """Convert the color space by the name of OpenCV's conversion: a new image, uint8 or float32.
 
     Parameters
@@ -147,6 +101,8 @@ def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
     conv
         ``"RGB2YCrCb"``, ``"BGR2LUV"``, ``"RGB2GRAY"``, ..., or an inverse such as ``"YCrCb2RGB"``, in upper
         or lower case; a color space alone, such as ``"LUV"``, means from RGB.
+    color_space
+        Another name of `conv`, for such a color space.
 
     Examples
     --------
@@ -154,6 +110,7 @@ def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
     [[[200, 128, 128]]]
     """
     image = check_lesson_image(img, drop_alpha=True)
+    conv = conv if color_space is None else color_space
     names = str(conv).upper().rpartition("2")
     source, target = (_OPENCV_SPACES.get(name) for name in (names[0] or "RGB", names[2]))
     if source in (None, "GRAY") or target is None or {source, target}.isdisjoint({"RGB", "BGR"}):
@@ -166,15 +123,16 @@ def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
     return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_{source}2{target}")))
 
 
+@lesson_function()
 def get_hog_features(
     img: Any,
-    orient: int,
-    pix_per_cell: int,
-    cell_per_block: int,
+    orient: int = 9,
+    pix_per_cell: int = 8,
+    cell_per_block: int = 2,
     vis: bool = False,
     feature_vec: bool = True,
     *,
-    transform_sqrt: bool | None = None,
+    transform_sqrt: bool = False,
     visualise: bool = False,
     visualize: bool = False,
 ) -> Any:
@@ -195,8 +153,8 @@ def get_hog_features(
     feature_vec
         Return the features as a vector; False gives the array of blocks.
     transform_sqrt
-        Take the square root of the values first. The course has published both: a model trained one way does
-        not work the other way. None is the default of `set_lesson_defaults`. No negative values for True.
+        Take the square root of the values first, which must not be negative. The course has published both:
+        a model trained one way does not work the other way.
 
     Examples
     --------
@@ -212,7 +170,7 @@ def get_hog_features(
             f"img must be one (H, W) channel of numbers, got {describe(img)}; pick one with image[..., 0]"
         )
     check_flags(vis=vis, visualise=visualise, visualize=visualize, feature_vec=feature_vec)
-    transform_sqrt = _check_switch(or_default(transform_sqrt, "transform_sqrt"), "transform_sqrt")
+    transform_sqrt = check_switch(transform_sqrt, "transform_sqrt")
     sizes = {"orient": orient, "pix_per_cell": pix_per_cell, "cell_per_block": cell_per_block}
     orient, pix_per_cell, cell_per_block = (check_integer(size, name, low=1) for name, size in sizes.items())
     channel = img if img.dtype in (np.uint8, np.float32) else img.astype(np.float64)
@@ -229,12 +187,13 @@ def get_hog_features(
     return features, picture
 
 
+@lesson_function(order="spatial_order")
 def bin_spatial(
     img: Any,
     size: Size | str = (32, 32),
     *last_size: Size,
     color_space: str = "RGB",
-    order: SpatialOrder = "interleaved",
+    order: str = "interleaved",
 ) -> NDArray[Any]:
     """Pixel values of a resized image, ``(width * height * channels,)`` of its dtype.
 
@@ -273,6 +232,7 @@ def bin_spatial(
     return (small if one_channel or order == "interleaved" else small.transpose(2, 0, 1)).ravel()
 
 
+@lesson_function(bins_range="hist_range")
 def color_hist(
     img: Image, nbins: int = 32, bins_range: tuple[float, float] | None = (0, 256)
 ) -> NDArray[np.int64]:
@@ -294,9 +254,33 @@ def color_hist(
     image = check_lesson_image(img, drop_alpha=True)
     check_integer(nbins, "nbins", low=1)
     limits = check_range(bins_range, "bins_range")
+    warn_of_first_bin(image, limits)
+    return _histogram(image, nbins, limits)
+
+
+def _histogram(image: Image, bins: int, limits: tuple[float, float] | None) -> NDArray[np.int64]:
+    """Histogram of each channel, one after the other; None is the range of the channel's values."""
     if limits is None:
-        return np.concatenate([np.histogram(image[..., channel], nbins)[0] for channel in range(3)])
-    return count_bins(bin_indices(image, nbins, limits), nbins)
+        return np.concatenate([np.histogram(image[..., channel], bins)[0] for channel in range(3)])
+    separate = (bin_indices(image, bins, limits) + np.arange(3) * (bins + 1)).ravel()
+    return np.bincount(separate, minlength=3 * (bins + 1)).reshape(3, -1)[:, :bins].ravel()
+
+
+def is_unit(image: Image) -> bool:
+    """Whether an image has values 0-1."""
+    low, high = _UNIT_MAXIMA
+    return image.dtype != np.uint8 and low < image.max() <= high
+
+
+def warn_of_first_bin(image: Image, limits: tuple[float, float] | None, color_space: str = "RGB") -> None:
+    """Warn if all values of a 0-1 image fall into the first bin of a histogram."""
+    if limits is not None and limits[1] > 100 and color_space in UNIT_CHANNELS and is_unit(image):
+        low, high = limits
+        warn(
+            f"the image has values 0-1, which are all in the first bin of a histogram of {low:g}-{high:g}: "
+            'its colors are lost. Pass hist_range=(0, 1) or None, or read PNG files as 0-255: imread="cv2"; '
+            "find_cars divides by 255 unless divide_by=1 is passed, and set_lesson_defaults sets them all"
+        )
 
 
 def hog_blocks(
@@ -327,44 +311,7 @@ def bin_indices(image: Image, bins: int, limits: tuple[float, float]) -> NDArray
     return indices.ravel()[image] if image.dtype == np.uint8 else indices
 
 
-def count_bins(indices: NDArray[np.intp], bins: int) -> NDArray[np.int64]:
-    """Histogram of each channel from `bin_indices`, one after the other."""
-    separate = (indices + np.arange(3) * (bins + 1)).ravel()
-    return np.bincount(separate, minlength=3 * (bins + 1)).reshape(3, -1)[:, :bins].ravel()
-
-
-def accept_cspace(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Accept ``cspace=``, the name of ``color_space=`` in two earlier quizzes.
-
-    Each of them computes one group of features, HOG or spatial bins and histograms. Without the switches
-    ``spatial_feat=`` ..., the group follows from the options. The HOG quiz's positional order is an error.
-    """
-
-    @functools.wraps(function)
-    def call(*args: Any, **kwargs: Any) -> Result:
-        # A number as spatial_size and a channel as pix_per_cell show the order of the HOG quiz.
-        is_number = [isinstance(value, (int, np.integer)) for value in args]
-        if len(args) > 5 and is_number[2] and (isinstance(args[5], str) or (is_number[5] and args[5] <= 3)):
-            names = ("cspace", "orient", "pix_per_cell", "cell_per_block", "hog_channel")
-            named = ", ".join(f"{name}={value!r}" for name, value in zip(names, args[1:]))
-            raise InvalidInputError(
-                "the arguments after color_space must be spatial_size, hist_bins, orient, pix_per_cell, ...; "
-                f"got those of the HOG quiz in its order. Pass them by name: {named}"
-            )
-        if "cspace" in kwargs:
-            if "color_space" in kwargs:
-                raise InvalidInputError("color_space and cspace are the same option; pass one of them")
-            kwargs["color_space"] = kwargs.pop("cspace")
-            color = not kwargs.keys().isdisjoint({"spatial_size", "hist_bins", "hist_range"})
-            hog = not kwargs.keys().isdisjoint({"orient", "pix_per_cell", "cell_per_block", "hog_channel"})
-            if color != hog and kwargs.keys().isdisjoint({"spatial_feat", "hist_feat", "hog_feat"}):
-                kwargs.update(spatial_feat=color, hist_feat=color, hog_feat=hog)
-        return function(*args, **kwargs)
-
-    return call
-
-
-@accept_cspace
+@lesson_function()
 def single_img_features(
     img: Image,
     color_space: str = "RGB",
@@ -380,8 +327,8 @@ def single_img_features(
     vis: bool = False,
     *,
     hist_range: tuple[float, float] | None = (0, 256),
-    transform_sqrt: bool | None = None,
-    spatial_order: SpatialOrder = "interleaved",
+    transform_sqrt: bool = False,
+    spatial_order: str = "interleaved",
 ) -> Any:
     """Feature vector of one image; the options are those of `extract_features`.
 
@@ -408,7 +355,7 @@ def single_img_features(
     return features, picture
 
 
-@accept_cspace
+@lesson_function()
 def extract_features(
     imgs: Iterable[str | os.PathLike[str] | Image],
     color_space: str = "RGB",
@@ -423,9 +370,10 @@ def extract_features(
     hog_feat: bool = True,
     *,
     hist_range: tuple[float, float] | None = (0, 256),
-    transform_sqrt: bool | None = None,
-    spatial_order: SpatialOrder = "interleaved",
-    imread: Callable[[str], Image] | None = None,
+    transform_sqrt: bool = False,
+    spatial_order: str = "interleaved",
+    imread: Literal["mpimg", "cv2"] | Callable[[str], Image] = "mpimg",
+    channel_order: Literal["RGB", "BGR"] = "RGB",
 ) -> list[NDArray[Any]]:
     """Feature vectors of a list of images.
 
@@ -446,10 +394,10 @@ def extract_features(
         See `get_hog_features`.
     hog_channel, spatial_feat, hist_feat, hog_feat
         0, 1, 2 or ``"ALL"``, and switches for the three parts.
-    imread
-        Function that reads a file as RGB. None reads like ``mpimg.imread``: a PNG as float 0-1, other files
-        as uint8. ``vehicle_detection.read_image`` reads every file as uint8, which is faster; search uint8
-        images then, and pass ``divide_by=1`` to `find_cars`.
+    imread, channel_order
+        ``"mpimg"`` reads a PNG as float 0-1 and other files as uint8, ``"cv2"`` all as uint8, which is
+        faster: search uint8 images then, and pass ``divide_by=1`` to `find_cars`. Or a function of a file
+        name. ``"BGR"`` has blue first, as ``cv2.imread`` without a conversion.
 
     Examples
     --------
@@ -457,15 +405,13 @@ def extract_features(
     >>> [len(vector) for vector in extract_features(images, cspace="HLS", orient=9)]
     [1764, 1764]
     """
-    options, read = FeatureOptions.of(locals()), _read_like_lesson if imread is None else imread
+    options, read = FeatureOptions.of(locals()), _reader(imread, channel_order)
     if not is_listing(imgs):
         raise InvalidInputError(f"imgs must be a list of file names or images; got {describe(imgs)}")
     if isinstance(imgs, np.ndarray) and imgs.ndim in (2, 3) and imgs.dtype.kind in "uif":
         raise InvalidInputError(
             f"imgs must be a list of images, got {describe(imgs)}; pass [image], or use single_img_features"
         )
-    if not callable(read):
-        raise InvalidInputError(f"imread must be a function of a file name; got {describe(imread)}")
     if isinstance(imgs, np.ndarray) and are_uint8_patches(imgs):
         return options.compute(imgs)
     items: list[Any] = list(imgs)
@@ -479,9 +425,22 @@ def extract_features(
     return vectors
 
 
-def _read_like_lesson(path: str) -> Image:
-    image = read_image(path)
-    return np.divide(image, 255, dtype=np.float32) if path.lower().endswith(".png") else image
+extract_features_all = extract_features
+
+
+def _reader(imread: str | Callable[[str], Image], channel_order: str) -> Callable[[str], Image]:
+    check_choice(channel_order, "channel_order", CHANNEL_ORDERS)
+    if callable(imread):
+        return imread
+    check_choice(imread, "imread", READERS)
+
+    def read(path: str) -> Image:
+        image: Image = read_image(path)
+        image = image if channel_order == "RGB" else np.ascontiguousarray(image[..., ::-1])
+        is_unit = imread == "mpimg" and path.lower().endswith(".png")
+        return np.divide(image, 255, dtype=np.float32) if is_unit else image
+
+    return read
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -495,16 +454,16 @@ class FeatureOptions(Checked):
     pix_per_cell: int = integer(low=1)
     cell_per_block: int = integer(low=1)
     hog_channel: int | str = choice(MISSING, (0, 1, 2, "ALL"))
-    spatial_feat: bool = checked_field(MISSING, _check_switch)
-    hist_feat: bool = checked_field(MISSING, _check_switch)
-    hog_feat: bool = checked_field(MISSING, _check_switch)
+    spatial_feat: bool = checked_field(MISSING, check_switch)
+    hist_feat: bool = checked_field(MISSING, check_switch)
+    hog_feat: bool = checked_field(MISSING, check_switch)
     hist_range: tuple[float, float] | None = checked_field(MISSING, check_range)
-    transform_sqrt: bool = checked_field(MISSING, _check_switch)
+    transform_sqrt: bool = checked_field(MISSING, check_switch)
     spatial_order: Literal["interleaved", "channels"] = choice(MISSING, SPATIAL_ORDERS)
 
     def __post_init__(self) -> None:
         for switch, unused in _UNUSED.items():  # the lesson's code does not read them
-            if not _check_switch(getattr(self, switch), switch):
+            if not check_switch(getattr(self, switch), switch):
                 for name, value in unused.items():
                     object.__setattr__(self, name, value)
         super().__post_init__()
@@ -515,7 +474,6 @@ class FeatureOptions(Checked):
     def of(cls, arguments: dict[str, Any]) -> Self:
         """Pick the options from all arguments of a lesson function by name; check each set of them once."""
         options = {field.name: arguments[field.name] for field in dataclasses.fields(cls)}
-        options["transform_sqrt"] = or_default(options["transform_sqrt"], "transform_sqrt")
         key = f"{cls.__name__}({options})"
         if key not in _checked:
             if len(_checked) == _MAX_CHECKED:
@@ -559,6 +517,8 @@ class FeatureOptions(Checked):
 
     def compute(self, images: Images) -> list[NDArray[Any]]:
         """Feature vectors of images in the lesson's order: float32 from the kernels, else float64."""
+        if self.hist_feat and len(images):
+            warn_of_first_bin(images[0], self.hist_range, self.color_space)
         params = self.params if self.has_library_range else None
         if params is None or not are_uint8_patches(images):
             return [self._compute_one(image) for image in images]
@@ -578,7 +538,7 @@ class FeatureOptions(Checked):
         if self.spatial_feat:
             parts.append(bin_spatial(converted, self.spatial_size, order=self.spatial_order))
         if self.hist_feat:
-            parts.append(color_hist(converted, self.hist_bins, self.hist_range))
+            parts.append(_histogram(converted, self.hist_bins, self.hist_range))
         return parts
 
     def hog_source(self, converted: Image) -> Image:

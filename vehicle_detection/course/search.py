@@ -9,33 +9,29 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
-import sys
-import warnings
+import functools
+from collections.abc import Callable
 from dataclasses import MISSING, dataclass
-from typing import Any, Literal
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Workspace, choice, describe, integer, number
+from vehicle_detection._common import Workspace, check_choice, choice, describe, integer, number
 from vehicle_detection.course.features import (
-    FORMULAS,
     FeatureOptions,
-    Formula,
     Image,
     Size,
-    SpatialOrder,
-    accept_cspace,
     are_uint8_patches,
     bin_indices,
-    bin_spatial,
     check_lesson_image,
-    color_hist,
     convert_color,
-    count_bins,
+    is_unit,
+    warn_of_first_bin,
 )
-from vehicle_detection.course.windows import BLUE, THICKNESS, Box, box_rows, corner_array
+from vehicle_detection.course.versions import FORMULAS, RETURNS, lesson_function, warn
+from vehicle_detection.course.windows import Corners, box_rows, corner_array, draw_boxes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE
 from vehicle_detection.search import BandFilters
@@ -47,14 +43,10 @@ from vehicle_detection.svm import (
     n_features,
 )
 
-ResizeOrder = Literal["after conversion", "before conversion"]
+Result = TypeVar("Result")
 
 # Number of windows whose features are in memory at a time.
 _CHUNK = 512
-# Greatest value of a channel of a 0-1 image, with a margin: V of YUV reaches 1.12.
-_MAX_UNIT = 1.2
-# Least share of the values outside of the first bins that shows histograms of another range than 0-1.
-_MIN_SPREAD = 0.1
 # The attributes that a linear classifier and a scaler compute with.
 _MODEL_STATE = (
     "classes_", "n_features_in_",
@@ -62,7 +54,7 @@ _MODEL_STATE = (
 )  # fmt: skip
 
 
-@accept_cspace
+@lesson_function()
 def search_windows(
     img: Image,
     windows: Any,
@@ -80,8 +72,8 @@ def search_windows(
     hist_feat: bool = True,
     hog_feat: bool = True,
     *,
-    transform_sqrt: bool | None = None,
-    spatial_order: SpatialOrder = "interleaved",
+    transform_sqrt: bool = False,
+    spatial_order: str = "interleaved",
 ) -> list[Any]:
     """Classify each window of an image, resized to 64x64 pixels.
 
@@ -140,6 +132,33 @@ def search_windows(
     return found
 
 
+# Names of the positional arguments, and of those that published versions insert after the scale or append.
+_POSITIONAL = (
+    "img", "ystart", "ystop", "scale", "svc", "X_scaler", "orient", "pix_per_cell", "cell_per_block",
+    "spatial_size", "hist_bins",
+)  # fmt: skip
+_SPACE, _SWITCHES = ("color_space", "hog_channel"), ("spatial_feat", "hist_feat", "hog_feat")
+
+
+def _accept_published_orders(function: Callable[..., Result]) -> Callable[..., Result]:
+    """Name the positional arguments of versions with more of them than the lesson."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **options: Any) -> Result:
+        names = [*_POSITIONAL, *(_SWITCHES if args[11:12] in ((True,), (False,)) else (*_SPACE, *_SWITCHES))]
+        if len(args) > 4 and isinstance(args[4], str):
+            names = [*_POSITIONAL[:4], *_SPACE, *_POSITIONAL[4:]]
+            args = args[:13]  # another one says whether to draw
+            options = {"spatial_feat": args[11] is not None, "hist_feat": args[12] is not None, **options}
+        if len(args) > len(names):
+            raise TypeError(f"find_cars() takes up to {len(names)} positional arguments; got {len(args)}")
+        return function(**dict(zip(names, args)), **options)
+
+    return call
+
+
+@_accept_published_orders
+@lesson_function(formula="find_cars_formula", returns="find_cars_returns")
 def find_cars(
     img: Image,
     ystart: int | None,
@@ -159,64 +178,17 @@ def find_cars(
     hist_feat: bool = True,
     hog_feat: bool = True,
     hist_range: tuple[float, float] | None = (0, 256),
-    transform_sqrt: bool | None = None,
-    spatial_order: SpatialOrder = "interleaved",
+    transform_sqrt: bool = False,
+    spatial_order: str = "interleaved",
     cells_per_step: int = 2,
     divide_by: float = 255,
-    resize: ResizeOrder = "after conversion",
-    formula: Formula = "old",
-) -> Image:
-    """Draw the windows of `find_car_windows` on a copy of the image; the arguments are the same.
+    resize: str = "after conversion",
+    formula: str = "old",
+    returns: str = "picture",
+) -> Any:
+    """Search a band of an image at one scale, with one HOG for all windows, and draw the hits on a copy.
 
-    Returns a new image with blue rectangles, 6 pixels thick.
-
-    Examples
-    --------
-    >>> from sklearn.dummy import DummyClassifier
-    >>> from sklearn.preprocessing import StandardScaler
-    >>> svc = DummyClassifier(strategy="constant", constant=1).fit([[0], [0]], [0, 1])
-    >>> scaler = StandardScaler().fit(np.zeros((2, 8460)))
-    >>> drawn = find_cars(np.zeros((96, 96, 3), np.uint8), 0, 96, 1, svc, scaler, 9, 8, 2, (32, 32), 32)
-    >>> drawn[0, 0].tolist(), drawn[40, 40].tolist()
-    ([0, 0, 255], [0, 0, 0])
-    """
-    boxes = find_car_windows(**locals())  # all arguments
-    drawn: Image = np.array(img, order="C")
-    for corner, opposite in boxes:
-        cv2.rectangle(drawn, corner, opposite, BLUE, THICKNESS)
-    return drawn
-
-
-def find_car_windows(
-    img: Image,
-    ystart: int | None,
-    ystop: int | None,
-    scale: float,
-    svc: Any,
-    X_scaler: Any,
-    orient: int,
-    pix_per_cell: int,
-    cell_per_block: int,
-    spatial_size: Size,
-    hist_bins: int,
-    *,
-    color_space: str = "YCrCb",
-    hog_channel: int | str = "ALL",
-    spatial_feat: bool = True,
-    hist_feat: bool = True,
-    hog_feat: bool = True,
-    hist_range: tuple[float, float] | None = (0, 256),
-    transform_sqrt: bool | None = None,
-    spatial_order: SpatialOrder = "interleaved",
-    cells_per_step: int = 2,
-    divide_by: float = 255,
-    resize: ResizeOrder = "after conversion",
-    formula: Formula = "old",
-) -> list[Box]:
-    """Search a band of an image at one scale, with one HOG for all windows: the boxes that `find_cars` draws.
-
-    Returns corner pairs ``((x1, y1), (x2, y2))`` of the windows for which the classifier predicts 1, column
-    by column, as in the quiz.
+    The hits are those of `reference.find_car_windows`, column by column, as in the quiz.
 
     Parameters
     ----------
@@ -227,7 +199,8 @@ def find_car_windows(
     svc, X_scaler
         As `clf` and `scaler` of `search_windows`.
     orient, pix_per_cell, cell_per_block, spatial_size, hist_bins
-        As in `extract_features`, of the features that the classifier was trained on.
+        As in `extract_features`, of the features that the classifier was trained on. Published versions with
+        ``color_space, hog_channel`` after `scale`, or with further arguments at the end, are understood.
     color_space, hog_channel, spatial_feat, hist_feat, hog_feat, hist_range, transform_sqrt, spatial_order
         As in `extract_features`. Pass ``spatial_order="channels", hist_range=None`` for a model trained with
         the functions of the quiz, which order the bins by channel and take the range of each channel.
@@ -244,27 +217,28 @@ def find_car_windows(
     formula
         Number of steps along an axis; the course has published both. ``"old"``:
         ``(blocks - blocks per window) // cells_per_step``, which leaves out the last position; ``"new"`` adds
-        one. `set_lesson_defaults` does not change this default.
+        one.
+    returns
+        ``"picture"``: a new image with blue rectangles, 6 pixels thick; ``"boxes"``: corner pairs
+        ``((x1, y1), (x2, y2))`` of the hits, as `find_car_windows`; ``"both"``: a pair of them.
 
     Examples
     --------
+    >>> from sklearn.dummy import DummyClassifier
     >>> from sklearn.preprocessing import StandardScaler
-    >>> from sklearn.svm import LinearSVC
-    >>> from vehicle_detection import render_patches
-    >>> from vehicle_detection.course import extract_features
-    >>> patches, labels = render_patches(40)
-    >>> X = extract_features(patches, "YCrCb", (16, 16), hog_channel="ALL")
-    >>> scaler = StandardScaler().fit(X)
-    >>> svc = LinearSVC(random_state=0).fit(scaler.transform(X), labels)
-    >>> frame = np.full((144, 240, 3), 90, np.uint8)
-    >>> frame[32:96, 64:128] = patches[0]
-    >>> boxes = find_car_windows(frame, 0, 144, 1, svc, scaler, 9, 8, 2, (16, 16), 32, divide_by=1)
-    >>> ((64, 32), (128, 96)) in boxes
-    True
+    >>> svc = DummyClassifier(strategy="constant", constant=1).fit([[0], [0]], [0, 1])
+    >>> scaler = StandardScaler().fit(np.zeros((2, 8460)))
+    >>> image = np.zeros((96, 96, 3), np.uint8)
+    >>> drawn = find_cars(image, 0, 96, 1, svc, scaler, 9, 8, 2, (32, 32), 32)
+    >>> drawn[0, 0].tolist(), drawn[40, 40].tolist()
+    ([0, 0, 255], [0, 0, 0])
+    >>> find_car_windows(image, 0, 96, 1, svc, scaler, 9, 8, 2, (32, 32), 32)
+    [((0, 0), (64, 64)), ((0, 16), (64, 80)), ((16, 0), (80, 64)), ((16, 16), (80, 80))]
     """
+    check_choice(returns, "returns", RETURNS)
     options, image = _SearchOptions.of(locals()), check_lesson_image(img)
     top, bottom = options.rows(image.shape[0])
-    image = _scale_values(image[top:bottom], options.divide_by)
+    image = scale_values(image[top:bottom], options.divide_by)
     estimators = _check_estimators(svc, X_scaler, options, image)
     if resize == "after conversion":
         converted = _shrink(convert_color(image, color_space), scale)
@@ -272,10 +246,19 @@ def find_car_windows(
         converted = convert_color(_shrink(image, scale), color_space)
     hits = _search_band(converted, estimators, options)
     stride, side = cells_per_step * options.pix_per_cell, int(PATCH_SIZE * scale)
-    boxes = []
+    boxes: list[Corners] = []
     for column, row in np.argwhere(hits.T).tolist():
         x, y = int(column * stride * scale), int(row * stride * scale) + top
         boxes.append(((x, y), (x + side, y + side)))
+    if returns == "boxes":
+        return boxes
+    return draw_boxes(img, boxes) if returns == "picture" else (draw_boxes(img, boxes), boxes)
+
+
+@functools.wraps(find_cars, assigned=())
+def find_car_windows(*args: Any, **options: Any) -> list[Corners]:
+    """Return the boxes that `find_cars` draws; the arguments are the same."""
+    boxes: list[Corners] = find_cars(*args, **{**options, "returns": "boxes"})
     return boxes
 
 
@@ -302,7 +285,7 @@ class _SearchOptions(FeatureOptions):
         return top, bottom
 
 
-def _scale_values(image: Image, divide_by: float) -> Image:
+def scale_values(image: Image, divide_by: float) -> Image:
     """Divide an image like the quiz, but not a float image with values 0-1."""
     if divide_by == 1 or (image.dtype != np.uint8 and image.max() <= 1):
         return image
@@ -334,40 +317,21 @@ def _search_band(converted: Image, estimators: _Estimators, options: _SearchOpti
         window = (options.blocks, options.blocks)
         view = np.lib.stride_tricks.sliding_window_view(options.hog(converted), window, axis=(1, 2))
         hog = view.transpose(1, 2, 0, 6, 7, 3, 4, 5)[::cells_per_step, ::cells_per_step]
-    indices = None
-    if options.hist_feat and options.hist_range is not None:
-        indices = bin_indices(converted, options.hist_bins, options.hist_range)
     positions = np.indices((rows, columns)).reshape(2, -1).T
     hits = []
     for start in range(0, len(positions), _CHUNK):
         features = np.empty((len(positions[start : start + _CHUNK]), options.length))
         for vector, (row, column) in zip(features, positions[start:].tolist()):
             y, x = row * cells_per_step * cell, column * cells_per_step * cell
-            parts = _window_color(converted, indices, y, x, options)
+            patch = converted[y : y + PATCH_SIZE, x : x + PATCH_SIZE]
+            if patch.shape[:2] != (PATCH_SIZE, PATCH_SIZE):  # cut by the border: a cell does not divide 64
+                patch = np.asarray(cv2.resize(patch, (PATCH_SIZE, PATCH_SIZE)))
+            parts = options.color_parts(patch)
             if hog is not None:
                 parts.append(hog[row, column].ravel())
             np.concatenate(parts, out=vector)
         hits.append(estimators.predict(features))
     return np.concatenate(hits).reshape(rows, columns)
-
-
-def _window_color(
-    converted: Image, indices: NDArray[np.intp] | None, y: int, x: int, options: FeatureOptions
-) -> list[NDArray[Any]]:
-    """Spatial bins and histogram of the window at ``(x, y)``; `indices` are the band's histogram bins."""
-    part = np.s_[y : y + PATCH_SIZE, x : x + PATCH_SIZE]
-    window = converted[part]
-    if window.shape[:2] != (PATCH_SIZE, PATCH_SIZE):
-        # The border may cut the last window if a cell does not divide 64.
-        return options.color_parts(np.asarray(cv2.resize(window, (PATCH_SIZE, PATCH_SIZE))))
-    parts: list[NDArray[Any]] = []
-    if options.spatial_feat:
-        parts.append(bin_spatial(window, options.spatial_size, order=options.spatial_order))
-    if indices is not None:
-        parts.append(count_bins(indices[part], options.hist_bins))
-    elif options.hist_feat:
-        parts.append(color_hist(window, options.hist_bins, None))
-    return parts
 
 
 def _fast_scores(
@@ -403,7 +367,6 @@ class _Estimators:
     filters: BandFilters | None  # for the fast search, if windows can share the features
     workspace: Workspace  # of the filters
     unit_range: bool | None  # whether the scaler was fitted on images with values 0-1; None if unknown
-    spread_histograms: bool  # whether it was fitted on histograms that such images cannot have
 
     def predict(self, features: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether the classifier predicts 1 for each of ``(N, length)`` feature vectors."""
@@ -479,51 +442,23 @@ def _read_estimators(clf: Any, scaler: Any, options: FeatureOptions, state: list
             filters = classifier.filters
     if options.hist_feat and not options.hist_range:
         filters = None
-    unit_range, spread = _was_fitted_on_unit_range(scaler, options), _has_spread_histograms(scaler, options)
-    return _Estimators(clf, scaler, options, state, classifier, filters, Workspace(), unit_range, spread)
+    unit_range = _was_fitted_on_unit_range(scaler, options)
+    return _Estimators(clf, scaler, options, state, classifier, filters, Workspace(), unit_range)
 
 
 def _warn_of_range(estimators: _Estimators, image: Image) -> None:
     """Warn if the values of an image have another range than those that the scaler was fitted on."""
-    trained_on_unit, options = estimators.unit_range, estimators.options
-    largest = 255.0 if image.dtype == np.uint8 else float(image.max())
-    if largest <= 0.1:
-        return  # an almost black image may have either range
-    if trained_on_unit is not None and (largest <= 2) != trained_on_unit:
-        trained, given = ("0-1", "0-255") if trained_on_unit else ("0-255", "0-1")
-        problem = f"the scaler was fitted on values {trained}, but the image has values {given}"
-    elif largest <= 2 and estimators.spread_histograms:
-        problem = (
-            "the scaler was fitted on histograms with values in many bins, but all values of a 0-1 image are "
-            f"in the first bin of hist_range={options.hist_range}"
-        )
-    else:
+    options, trained_on_unit = estimators.options, estimators.unit_range
+    if options.hist_feat:
+        warn_of_first_bin(image, options.hist_range, options.color_space)
+    if trained_on_unit is None or is_unit(image) == trained_on_unit or not image.max() > 0.1:
         return
-    warnings.warn(
-        f"{problem}, which makes predictions useless. extract_features and mpimg.imread read a PNG as 0-1 "
-        "and other files as 0-255; find_cars divides by 255 unless divide_by=1 is passed. A model trained "
-        'with the functions of the HOG sub-sampling quiz needs hist_range=None and spatial_order="channels".',
-        stacklevel=_caller_level(),
+    trained, given = ("0-1", "0-255") if trained_on_unit else ("0-255", "0-1")
+    warn(
+        f"the scaler was fitted on values {trained}, but the image has values {given}, which makes "
+        "predictions useless. extract_features and mpimg.imread read a PNG as 0-1 and other files as 0-255, "
+        'imread="cv2" reads all as 0-255; find_cars divides by 255 unless divide_by=1 is passed'
     )
-
-
-def _caller_level() -> int:
-    """Return the ``stacklevel`` for a warning of the calling function that names the user's code."""
-    frame, level = sys._getframe(1), 1
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("vehicle_detection."):
-        frame, level = frame.f_back, level + 1
-    return level
-
-
-def _has_spread_histograms(scaler: Any, options: FeatureOptions) -> bool:
-    """Whether a scaler was fitted on histograms with values that channels of a 0-1 image cannot have."""
-    means = getattr(scaler, "mean_", None)
-    channels = list(UNIT_CHANNELS.get(options.color_space, ()))
-    if means is None or not (options.hist_feat and options.hist_range and channels):
-        return False
-    counts = means[options.spatial_length :][: 3 * options.hist_bins].reshape(3, -1)[channels]
-    lows = np.linspace(*options.hist_range, options.hist_bins, endpoint=False)
-    return bool(counts[:, lows > _MAX_UNIT].sum() > _MIN_SPREAD * counts.sum())
 
 
 def _was_fitted_on_unit_range(scaler: Any, options: FeatureOptions) -> bool | None:

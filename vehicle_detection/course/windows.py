@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 
 from vehicle_detection import heatmap as library
 from vehicle_detection._common import check_array, check_choice, check_integer, check_number, describe
-from vehicle_detection.course.features import FORMULAS, Formula, Image, check_lesson_image, or_default
+from vehicle_detection.course.features import Image, check_lesson_image
+from vehicle_detection.course.versions import FORMULAS, lesson_function
 from vehicle_detection.errors import InvalidInputError
 
-Box = tuple[tuple[int, int], tuple[int, int]]
+Corners = tuple[tuple[int, int], tuple[int, int]]
 
 BLUE = (0, 0, 255)
 THICKNESS = 6
 
 
+@lesson_function()
 def slide_window(
     img: Any,
     x_start_stop: Sequence[float | None] = (None, None),
@@ -27,8 +29,8 @@ def slide_window(
     xy_window: Sequence[float] = (64, 64),
     xy_overlap: Sequence[float] = (0.5, 0.5),
     *,
-    formula: Formula | None = None,
-) -> list[Box]:
+    formula: str = "old",
+) -> list[Corners]:
     """List the windows of one size over a region of an image, row by row.
 
     Returns corner pairs ``((x1, y1), (x2, y2))``.
@@ -44,8 +46,7 @@ def slide_window(
     formula
         Number of windows along an axis; the course has published both. ``"old"``: ``int(span / step) - 1``;
         with overlaps above 0.5 the last windows extend beyond the region, and below 0.5 some that fit are
-        left out. ``"new"``: ``int((span - int(window * overlap)) / step)``, the windows that fit. None is the
-        default of `set_lesson_defaults`, initially ``"old"``.
+        left out. ``"new"``: ``int((span - int(window * overlap)) / step)``, the windows that fit.
 
     Examples
     --------
@@ -56,7 +57,6 @@ def slide_window(
     """
     if not isinstance(img, np.ndarray) or img.ndim < 2:
         raise InvalidInputError(f"img must be an image array; got {describe(img)}")
-    formula = or_default(formula, "formula")
     check_choice(formula, "formula", FORMULAS)
     for name, pair in (("xy_window", xy_window), ("xy_overlap", xy_overlap)):
         if check_array(pair, name).shape != (2,):
@@ -86,7 +86,7 @@ def _check_span(limits: Any, size: int, name: str) -> tuple[int, int]:
     return start, stop
 
 
-def _window_starts(start: int, stop: int, side: int, overlap: float, formula: Formula) -> range:
+def _window_starts(start: int, stop: int, side: int, overlap: float, formula: str) -> range:
     """First pixels of the windows along one axis."""
     step = int(side * (1 - check_number(overlap, "xy_overlap", low=0)))
     if step < 1:
@@ -205,22 +205,57 @@ def draw_labeled_bboxes(img: Image, labels: Any) -> Image:
     >>> draw_labeled_bboxes(image, label(heat)) is image, image[29, 49].tolist()
     (True, [0, 0, 255])
     """
-    from scipy.ndimage import find_objects
-
     check_lesson_image(img)
+    corners = labeled_bboxes(labels, img.shape[:2])
     rows = img.strides[0] > 0 and img.strides[1:] == (3 * img.itemsize, img.itemsize)
-    array, count = labels if isinstance(labels, (tuple, list)) and len(labels) == 2 else (None, 0)
-    if not isinstance(array, np.ndarray) or array.shape != img.shape[:2] or array.dtype.kind not in "iu":
-        raise InvalidInputError(
-            f"labels must be the pair that scipy.ndimage.label returns for a map of {img.shape[:2]}; "
-            f"got {describe(labels)}"
-        )
-    regions = find_objects(array, max_label=check_integer(count, "the number of labels", low=0))
-    corners = [[x.start, y.start, x.stop - 1, y.stop - 1] for y, x in filter(None, regions)]
     if corners and not (img.flags.writeable and rows):
         raise InvalidInputError("img must be writable and contiguous to be drawn on; pass numpy.copy(img)")
     draw_corners(img, corner_array(corners, "labels"))
     return img
+
+
+def labeled_bboxes(labels: Any, shape: tuple[int, ...] | None = None) -> list[Corners]:
+    """First and last pixel of each region that ``scipy.ndimage.label`` finds in an image of `shape`."""
+    from scipy.ndimage import find_objects
+
+    array, count = labels if isinstance(labels, (tuple, list)) and len(labels) == 2 else (None, 0)
+    array = array if isinstance(array, np.ndarray) else np.array(None)
+    if array.ndim != 2 or array.dtype.kind not in "iu" or shape not in (None, array.shape):
+        raise InvalidInputError(
+            f"labels must be the pair that scipy.ndimage.label returns for a map of {shape or '(H, W)'}; "
+            f"got {describe(labels)}"
+        )
+    regions = find_objects(array, max_label=check_integer(count, "the number of labels", low=0))
+    return [((x.start, y.start), (x.stop - 1, y.stop - 1)) for y, x in filter(None, regions)]
+
+
+def bounding_boxes(image: Image, windows: Any, threshold: float = 1) -> list[Corners]:
+    """Boxes of the regions of an image that more than `threshold` hot windows cover: heat, threshold, labels.
+
+    Examples
+    --------
+    >>> windows = [((0, 0), (8, 8)), ((4, 0), (12, 8))]
+    >>> bounding_boxes(np.zeros((20, 20, 3)), windows, 1)
+    [((4, 0), (7, 7))]
+    """
+    from scipy.ndimage import label
+
+    heat = add_heat(np.zeros(image.shape[:2]), windows)
+    return labeled_bboxes(label(apply_threshold(heat, threshold)))
+
+
+def show_images(images: Sequence[Image], titles: Sequence[str] = (), columns: int = 2) -> None:
+    """Show images in a grid with matplotlib's pyplot: RGB, or ``(H, W)`` in a color map."""
+    import matplotlib.pyplot as plt
+
+    rows, columns = -(-len(images) // columns), min(columns, len(images))
+    panels = plt.subplots(rows, columns, figsize=(6 * columns, 3.6 * rows), squeeze=False)[1].ravel()
+    for panel, image in zip(panels, images):
+        panel.imshow(image, cmap="hot" if image.ndim == 2 else None)
+    for panel, title in zip(panels, titles):
+        panel.set_title(title)
+    for panel in panels:
+        panel.axis("off")
 
 
 def draw_corners(

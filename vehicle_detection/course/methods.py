@@ -1,0 +1,145 @@
+"""The two methods of the course to find hot windows: each by itself, and HOG sub-sampling."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._common import check_choice, check_integer, check_number, check_sequence, describe
+from vehicle_detection.course.search import find_car_windows, scale_values, search_windows
+from vehicle_detection.course.versions import lesson_defaults
+from vehicle_detection.course.windows import Corners, slide_window
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import PATCH_SIZE
+from vehicle_detection.search import REFERENCE_WIDTH, SearchBand, SearchParams
+from vehicle_detection.svm import VehicleClassifier, load_classifier
+from vehicle_detection.windows import find_cars as find_library_windows
+from vehicle_detection.windows import search_windows as search_library_windows
+
+# Scale, rows and columns.
+_Band = tuple[float, tuple[int, int], tuple[int, int]]
+FindWindows = Callable[[NDArray[np.uint8]], Any]
+
+# Size, rows and overlap of the four lists of windows of the first system: 130 in a 1280x720 frame.
+_WINDOW_LISTS = (
+    ((96, 96), (395, 530), (0.9, 0.5)),
+    ((110, 145), (380, 590), (0.7, 0.6)),
+    ((155, 165), (370, 590), (0.6, 0.5)),
+    ((170, 200), (400, 700), (0.6, 0.5)),
+)
+_COLUMNS = (650, 1280)
+_FEATURES = {
+    "orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "spatial_size": (32, 32), "hist_bins": 32,
+    "color_space": "YCrCb", "hog_channel": "ALL",
+}  # fmt: skip
+_FROZEN = ("divide_by", "cells_per_step", "transform_sqrt", "hist_range", "spatial_order")
+
+
+def read_bands(scales: Sequence[Any], rows: tuple[int, int]) -> list[_Band]:
+    """Scales with their rows and columns, checked."""
+    bands, usual = [], (rows, (0, REFERENCE_WIDTH))
+    for each in check_sequence(scales, "scales", "numbers"):
+        scale, *own = each if isinstance(each, tuple) else (each,)
+        pairs = [*own, *usual[len(own) :]]
+        if any(np.shape(pair) != (2,) or not 0 <= pair[0] < pair[1] for pair in pairs) or len(pairs) > 2:
+            raise InvalidInputError(
+                "scales must hold numbers, or (scale, (ystart, ystop), (xstart, xstop)) with start < stop; "
+                f"got {describe(each)} and the rows {rows}"
+            )
+        bands.append((check_number(scale, "scales", low=0.25, high=20), pairs[0], pairs[1]))
+    if not bands:
+        raise InvalidInputError("scales must hold a number at least, such as (1.0, 1.5); got none")
+    return bands
+
+
+def window_search(
+    clf: Any, scaler: Any, method: int, bands: list[_Band], options: dict[str, Any]
+) -> FindWindows:
+    """Return the function of an image that finds the hot windows."""
+    check_choice(method, "method", (1, 2))
+    if isinstance(clf, (str, os.PathLike)):
+        clf = load_classifier(clf)
+    if isinstance(clf, VehicleClassifier):
+        step = options.pop("cells_per_step", 2)
+        if scaler is not None or options:
+            raise InvalidInputError(
+                "scaler and options of the features must be omitted with a model of the library, which "
+                f"contains them; got {describe(scaler)} and {sorted(options)}"
+            )
+        if method == 1:
+            return lambda image: search_library_windows(image, _list_windows(image), clf).boxes
+        params = _search_params(bands, check_integer(step, "cells_per_step", low=1, high=8))
+        return lambda image: find_library_windows(image, clf, params).boxes
+    if callable(clf) and not hasattr(clf, "predict"):
+        return clf  # type: ignore[no-any-return]
+    scaled = hasattr(scaler, "transform") or (scaler is None and hasattr(clf, "steps"))
+    if not hasattr(clf, "predict") or not scaled:
+        raise InvalidInputError(
+            "clf must be a model of the library, a function of an image, or a fitted classifier with a "
+            f"scaler; got {describe(clf)} and {describe(scaler)}; pass the scaler, or a pipeline of both"
+        )
+    # Later changes of the defaults must not change a detector.
+    options = {**_FEATURES, **{name: lesson_defaults[name] for name in _FROZEN}, **options}
+    # An image of one window checks the options, the estimators and the range before the first frame.
+    white = np.full((PATCH_SIZE, PATCH_SIZE, 3), 255, np.uint8)
+    find_car_windows(white, None, None, 1, clf, scaler, **options)
+    if method == 2:
+        return functools.partial(_search_bands, model=(clf, scaler), bands=bands, options=options)
+    divide_by, _ = (options.pop(name) for name in _FROZEN[:2])
+
+    def search_list(image: NDArray[np.uint8]) -> Any:
+        return search_windows(scale_values(image, divide_by), _list_windows(image), clf, scaler, **options)
+
+    return search_list
+
+
+def _scale(pair: tuple[int, int], image: NDArray[np.uint8]) -> tuple[int, int]:
+    """Positions in an image of those in a 1280x720 frame."""
+    factor = max(image.shape) / REFERENCE_WIDTH
+    return round(pair[0] * factor), round(pair[1] * factor)
+
+
+def _list_windows(image: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """``(N, 4)`` windows of the four lists, in the right half; the border of the image cuts some off."""
+    windows = [
+        slide_window(
+            image, _scale(_COLUMNS, image), _scale(rows, image), _scale(size, image), overlap, formula="old"
+        )
+        for size, rows, overlap in _WINDOW_LISTS
+    ]
+    height, width = image.shape[:2]
+    return np.minimum(np.concatenate(windows).reshape(-1, 4), (width, height, width, height))
+
+
+def _search_bands(
+    image: NDArray[np.uint8], model: tuple[Any, Any], bands: list[_Band], options: dict[str, Any]
+) -> list[Corners]:
+    """Hits of `find_car_windows` for a classifier with a scaler at all scales."""
+    hits = []
+    for scale, rows, columns in bands:
+        (left, right), factor = _scale(columns, image), max(image.shape) / REFERENCE_WIDTH
+        found = find_car_windows(
+            image[:, left:right], *_scale(rows, image), scale * factor, *model, **options
+        )
+        hits += [((x1 + left, y1), (x2 + left, y2)) for (x1, y1), (x2, y2) in found]
+    return hits
+
+
+def _search_params(bands: list[_Band], cells_per_step: int) -> SearchParams:
+    """Bands of the library with the windows of the lesson's ``find_cars`` at each scale."""
+    overlap, horizon = 1 - cells_per_step / 8, 400
+    placed = [
+        SearchBand(
+            window=(PATCH_SIZE * scale,) * 2,
+            y=(top - horizon, bottom - horizon),
+            x=(left / REFERENCE_WIDTH, right / REFERENCE_WIDTH),
+            overlap=(overlap, overlap),
+        )
+        for scale, (top, bottom), (left, right) in bands
+    ]
+    return SearchParams(bands=tuple(placed), horizon=horizon / 720)

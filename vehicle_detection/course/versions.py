@@ -1,0 +1,325 @@
+"""The versions of the lesson: what published ones differ in, as defaults and found by calling a module."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import inspect
+import itertools
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+from unittest import mock
+
+import cv2
+import numpy as np
+
+from vehicle_detection._common import (
+    check_array,
+    check_choice,
+    check_flags,
+    check_integer,
+    check_number,
+    describe,
+)
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import SPATIAL_ORDERS
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+FORMULAS = ("old", "new")
+READERS = ("mpimg", "cv2")
+CHANNEL_ORDERS = ("RGB", "BGR")
+RETURNS = ("picture", "boxes", "both")
+# Names of options in earlier quizzes and in published versions.
+_ALIASES = {"cspace": "color_space", "orient_bins": "orient", "hog_channels": "hog_channel"}
+_COLOR_OPTIONS = {"spatial_size", "hist_bins", "hist_range"}
+_HOG_OPTIONS = {"orient", "pix_per_cell", "cell_per_block", "hog_channel"}
+_SWITCHES = {"spatial_feat", "hist_feat", "hog_feat"}
+
+
+def check_range(limits: Any, name: str) -> tuple[float, float] | None:
+    """Return the range of a histogram; None stands for the range of the values."""
+    if limits is None:
+        return None
+    if check_array(limits, name).shape != (2,):
+        raise InvalidInputError(f"{name} must be (low, high) or None; got {describe(limits)}")
+    low = check_number(limits[0], name)
+    return low, check_number(limits[1], name, above=low)
+
+
+def check_switch(value: Any, name: str) -> bool:
+    """Return a switch as a bool; the lesson's code also passes 0 and 1."""
+    check_flags(**{name: value})
+    return bool(value)
+
+
+def _one_of(choices: tuple[str, ...]) -> Callable[[Any, str], Any]:
+    def check(value: Any, name: str) -> Any:
+        check_choice(value, name, choices)
+        return value
+
+    return check
+
+
+# Check and initial value of each option of `set_lesson_defaults`.
+_OPTIONS: dict[str, tuple[Callable[[Any, str], Any], Any]] = {
+    "transform_sqrt": (check_switch, False),
+    "formula": (_one_of(FORMULAS), "old"),
+    "imread": (_one_of(READERS), "mpimg"),
+    "channel_order": (_one_of(CHANNEL_ORDERS), "RGB"),
+    "hist_range": (check_range, (0, 256)),
+    "spatial_order": (_one_of(SPATIAL_ORDERS), "interleaved"),
+    "find_cars_returns": (_one_of(RETURNS), "picture"),
+    "find_cars_formula": (_one_of(FORMULAS), "old"),
+    "cells_per_step": (lambda value, name: check_integer(value, name, low=1), 2),
+    "divide_by": (lambda value, name: check_number(value, name, above=0), 255),
+}
+lesson_defaults = {name: value for name, (_, value) in _OPTIONS.items()}
+
+
+def set_lesson_defaults(**options: Any) -> None:
+    """Set the defaults in which published versions of ``lesson_functions.py`` differ.
+
+    They hold for later calls in this process that do not pass the option; a `HeatmapDetector` keeps those of
+    its construction. `detect_versions` finds them.
+
+    Parameters
+    ----------
+    transform_sqrt : bool
+        Of all functions that compute HOG, initially False. True if your own file calls scikit-image's ``hog``
+        with ``transform_sqrt=True``, as most published ones do.
+    formula, find_cars_formula : {"old", "new"}
+        Of `slide_window` and of `find_cars`, initially ``"old"``. ``"new"`` if your own ``slide_window``
+        computes ``nx_buffer``, and if your own ``find_cars`` adds 1 to ``nxsteps``.
+    imread, channel_order : {"mpimg", "cv2"}, {"RGB", "BGR"}
+        How `extract_features` reads files: ``"mpimg"`` PNG files as 0-1, initially; ``"cv2"`` all as 0-255;
+        ``"BGR"`` with blue first, as ``cv2.imread`` returns them, if your code does not convert them.
+    hist_range : tuple or None
+        Of all histograms, initially ``(0, 256)``. None for the range of the values of each channel.
+    spatial_order : {"interleaved", "channels"}
+        Of all spatial bins, initially ``"interleaved"``.
+    find_cars_returns : {"picture", "boxes", "both"}
+        What `find_cars` returns, initially the picture; ``"both"`` is a pair of the picture and the boxes.
+    divide_by, cells_per_step
+        Of `find_cars`, initially 255 and 2.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from vehicle_detection.course import slide_window
+    >>> image = np.zeros((64, 128, 3), np.uint8)
+    >>> set_lesson_defaults(formula="new")
+    >>> len(slide_window(image, xy_overlap=(0.5, 0)))
+    3
+    >>> set_lesson_defaults(formula="old")
+    """
+    for name in options:
+        check_choice(name, "a name of an option", tuple(_OPTIONS))
+    lesson_defaults.update({name: _OPTIONS[name][0](value, name) for name, value in options.items()})
+
+
+def warn(message: str) -> None:
+    """Warn with the line of the user's code that called the library."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_back.f_globals.get("__name__", "").startswith(
+        "vehicle_detection."
+    ):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level + 1)
+
+
+def lesson_function(**renamed: str) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+    """Let options of a function that a call does not pass have the defaults of `set_lesson_defaults`.
+
+    `renamed` are the names of these defaults, where they differ from those of the options. The function also
+    accepts the names that options have in published versions.
+    """
+
+    def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+        names = list(inspect.signature(function).parameters)
+
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Result:
+            if "spatial_feat" in names and "ystart" not in names:
+                _read_earlier_quiz(args, kwargs)
+            for alias in _ALIASES.keys() & kwargs.keys():
+                name = _ALIASES[alias]
+                if name in kwargs:
+                    raise InvalidInputError(f"{name} and {alias} are the same option; pass one of them")
+                kwargs[name] = kwargs.pop(alias)
+            for name in names[len(args) :]:
+                default = renamed.get(name, name)
+                if default in lesson_defaults:
+                    kwargs.setdefault(name, lesson_defaults[default])
+            return function(*args, **kwargs)
+
+        return call
+
+    return decorate
+
+
+def _read_earlier_quiz(args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+    """Select the features of two quizzes, whose ``extract_features`` has ``cspace=``.
+
+    One computes HOG alone, the other colors alone: without the switches, the options say which. The order of
+    the HOG quiz, with a number as spatial_size and a channel as pix_per_cell, is an error.
+    """
+    is_number = [isinstance(value, (int, np.integer)) for value in args]
+    if len(args) > 5 and is_number[2] and (isinstance(args[5], str) or (is_number[5] and args[5] <= 3)):
+        names = ("cspace", "orient", "pix_per_cell", "cell_per_block", "hog_channel")
+        named = ", ".join(f"{name}={value!r}" for name, value in zip(names, args[1:]))
+        raise InvalidInputError(
+            "the arguments after color_space must be spatial_size, hist_bins, orient, pix_per_cell, ...; "
+            f"got those of the HOG quiz in its order. Pass them by name: {named}"
+        )
+    if "cspace" in kwargs and _SWITCHES.isdisjoint(kwargs):
+        color, hog = (not options.isdisjoint(kwargs) for options in (_COLOR_OPTIONS, _HOG_OPTIONS))
+        if color != hog:
+            kwargs.update(spatial_feat=color, hist_feat=color, hog_feat=hog)
+
+
+def detect_versions(lesson: Any) -> dict[str, Any]:
+    """Find out which version of the lesson a module was written with, by calling its functions.
+
+    Returns the arguments of `set_lesson_defaults` that can be told. A warning names each function that fails
+    or that equals no version, because its author has changed it: go on using that one.
+
+    Parameters
+    ----------
+    lesson
+        Your own module of lesson functions, as imported, or ``sys.modules["__main__"]`` for a notebook. Its
+        functions are called with a small random image; their results are compared with the versions of
+        `vehicle_detection.course.reference`.
+
+    Examples
+    --------
+    >>> from vehicle_detection.course import reference
+    >>> versions = detect_versions(reference)
+    >>> versions["imread"], versions["formula"], versions["find_cars_returns"]
+    ('mpimg', 'old', 'picture')
+    """
+    found: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, call, versions, expected in _probes(Path(folder, "probe.png"), found):
+            function = getattr(lesson, name, None)
+            if not callable(function):
+                continue
+            try:
+                with _hog_of_2017(function):
+                    returned = call(function)
+            except Exception as error:
+                problem = f"fails: {type(error).__name__}: {error}"
+            else:
+                options = (dict(zip(versions, values)) for values in itertools.product(*versions.values()))
+                matching = (each for each in options if _are_equal(returned, expected(**each)))
+                found.update(version := next(matching, {}))
+                problem = "" if version else "equals no version of the lesson"
+            if problem:
+                warn(f"your {name} {problem}; go on using it, and do not import that of the library")
+    return found
+
+
+def _probes(file: Path, found: dict[str, Any]) -> Iterator[tuple[str, Any, dict[str, Any], Any]]:
+    """Names of functions, a call of each, its versions, and the results of the reference by version."""
+    from vehicle_detection.course import reference
+
+    noise = np.random.default_rng(0).integers(60, 180, (25, 30, 3), np.uint8)
+    image = np.asarray(cv2.resize(noise, (240, 200), interpolation=cv2.INTER_CUBIC))
+    patch = image[:64, :64]
+    cv2.imwrite(str(file), patch)
+    sizes = (9, 8, 2)
+    yield (
+        "get_hog_features",
+        lambda function: function(patch[:, :, 1], *sizes, vis=False, feature_vec=True),
+        {"transform_sqrt": (False, True)},
+        lambda **version: reference.get_hog_features(patch[:, :, 1], *sizes, **version),
+    )
+    region = [None, None], [8, None], (64, 64), (0.75, 0.6)
+    yield (
+        "slide_window",
+        lambda function: function(image, *region),
+        {"formula": FORMULAS},
+        lambda formula: reference.slide_window(image, *region, formula=formula),
+    )
+    yield (
+        "bin_spatial",
+        lambda function: function(patch, size=(16, 16)),
+        {"spatial_order": SPATIAL_ORDERS},
+        lambda spatial_order: reference.bin_spatial(patch, (16, 16), order=spatial_order),
+    )
+    yield (
+        "color_hist",
+        lambda function: function(patch, nbins=16),
+        {"hist_range": ((0, 256), None, (0, 1))},
+        lambda hist_range: reference.color_hist(patch, 16, hist_range),
+    )
+    kinds = {name: found[name] for name in ("transform_sqrt", "spatial_order", "hist_range") if name in found}
+    arguments: Any = [str(file)], "YCrCb", (16, 16), 16, *sizes, "ALL"
+    yield (
+        "extract_features",
+        lambda function: function(*arguments),
+        {"imread": READERS, "channel_order": CHANNEL_ORDERS},
+        functools.partial(reference.extract_features, *arguments, **kinds),
+    )
+
+    def call_find_cars(function: Any) -> Any:
+        recorder = _Recorder()
+        returned = function(image, 16, 200, 1.5, recorder, recorder, *sizes, (16, 16), 16)
+        parts = [isinstance(part, np.ndarray) for part in returned] if isinstance(returned, tuple) else []
+        found["find_cars_returns"] = (
+            "picture" if isinstance(returned, np.ndarray) else "both" if any(parts) else "boxes"
+        )
+        return recorder.rows
+
+    def expected_rows(find_cars_formula: str, **version: Any) -> Any:
+        recorder = _Recorder()
+        reference.find_cars(
+            image, 16, 200, 1.5, recorder, recorder, *sizes, (16, 16), 16, formula=find_cars_formula,
+            **version, **kinds,
+        )  # fmt: skip
+        return recorder.rows
+
+    choices = {"divide_by": (255, 1), "cells_per_step": (2, 1, 3), "find_cars_formula": FORMULAS}
+    yield "find_cars", call_find_cars, choices, expected_rows
+
+
+class _Recorder:
+    """A scaler and a classifier that keep the features of all windows, each of which is a vehicle."""
+
+    def __init__(self) -> None:
+        self.rows: list[Any] = []
+
+    def transform(self, features: Any) -> Any:
+        self.rows += list(np.array(features, np.float64))
+        return features
+
+    def predict(self, features: Any) -> Any:
+        return np.ones(len(features))
+
+    decision_function = predict
+
+
+@contextlib.contextmanager
+def _hog_of_2017(function: Any) -> Iterator[None]:
+    """Let a function call scikit-image's ``hog`` by the argument ``visualise`` of its earlier versions."""
+    names = getattr(function, "__globals__", {})
+    hog = names.get("hog")
+
+    def call(*args: Any, visualise: bool = False, **options: Any) -> Any:
+        assert hog is not None
+        return hog(*args, **{"visualize": visualise, **options})
+
+    with mock.patch.dict(names, {"hog": call} if callable(hog) else {}):
+        yield
+
+
+def _are_equal(found: Any, expected: Any) -> bool:
+    try:
+        return bool(np.shape(found) == np.shape(expected) and np.allclose(found, expected, 1e-4, 1e-4))
+    except (TypeError, ValueError):  # of another kind, such as a list of arrays
+        return False
