@@ -3,14 +3,15 @@
 import dataclasses
 import functools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.drive.drives import CAMERA, FPS, SHAPE, cut_in_times, log_frames, passing_times, simulate
-from vehicle_detection import Camera, TrackTable, find_events
+from tests.drive.drives import CAMERA, FPS, SHAPE, box_of, cut_in_times, log_frames, passing_times, simulate
+from vehicle_detection import Camera, Track, TrackTable, find_events
 from vehicle_detection._common import UNITS
 from vehicle_detection.drive import Event
 from vehicle_detection.drive.history import track_histories
@@ -46,11 +47,11 @@ def test_overtakes_and_cut_ins_are_found(scenario):
         traffic, _ = simulated(scenario, seed)
         sides = {True: "left", False: "right"}
         true = [
-            ("overtaking" if from_behind else "overtaken", sides[lane < 0], time)
+            ("overtook_us" if from_behind else "we_overtook", sides[lane < 0], time)
             for time, from_behind, lane in passing_times(traffic, 10)
         ]
         true += [("cut_in", sides[lane < 0], time) for time, lane in cut_in_times(traffic)]
-        found = listed(events_of(scenario, seed), "overtaking", "overtaken", "cut_in", "met", "passed")
+        found = listed(events_of(scenario, seed), "overtook_us", "we_overtook", "cut_in", "met", "passed")
         correct += matches(found, true)
         found_count, true_count = found_count + len(found), true_count + len(true)
     assert true_count >= len(SEEDS)
@@ -61,7 +62,7 @@ def test_overtakes_and_cut_ins_are_found(scenario):
 @pytest.mark.parametrize("scenario", ["closing", "highway"])
 def test_steady_traffic_has_no_passing_events(scenario):
     for seed in SEEDS:
-        assert not listed(events_of(scenario, seed), "overtaking", "overtaken", "cut_in", "passed")
+        assert not listed(events_of(scenario, seed), "overtook_us", "we_overtook", "cut_in")
 
 
 def test_oncoming_vehicles_are_met():
@@ -136,7 +137,7 @@ def test_headway_in_seconds_needs_the_own_speed():
 
 
 def test_the_own_speed_tells_standing_from_moving_vehicles():
-    slow = next(event for event in events_of("passing", 0) if event.kind == "overtaken")
+    slow = next(event for event in events_of("passing", 0) if event.kind == "we_overtook")
     for own_speed, kind in ((slow.closing_mps, "passed"), (0.0, "met")):
         found = events_of("passing", 0, own_speed_mps=own_speed)
         assert [event.kind for event in found if event.track_id == slow.track_id and event.side] == [kind]
@@ -215,6 +216,98 @@ def test_any_track_gives_consistent_events(seed, known, speed):
         assert all(math.isfinite(value) for value in vars(event).values() if isinstance(value, float))
 
 
+def table_on(distance, lateral, *, seconds=4.0, frames=120, confidence=0.9, first=1, **columns):
+    """Table of a vehicle at these distances and lateral positions (m), functions of the time (s)."""
+    vehicle = SimpleNamespace(distance=distance, lateral=lateral)
+    table = TrackTable()
+    for frame in range(frames):
+        box = box_of(vehicle, frame / 25) if frame < 25 * seconds else None
+        inside = None if box is None else np.clip(box, 0, [1280, 720, 1280, 720])
+        shown = inside is not None and inside[2] - inside[0] > 0.2 * (box[2] - box[0])
+        track = Track(
+            id=1, box=inside, score=2.0, state="confirmed", shown=True, age=1.0, misses=0,
+            time_since_update=0.0, velocity=(0, 0), confidence=confidence,
+            **{name: value(frame / 25) if callable(value) else value for name, value in columns.items()},
+        ) if shown else None  # fmt: skip
+        table.append(frame, frame / 25, [track] if track else [])
+    return table
+
+
+def kinds_on(distance, lateral, *, own_speed_mps=None, **options):
+    events = find_events(
+        table_on(distance, lateral, **options), fps=25, shape=SHAPE, own_speed_mps=own_speed_mps
+    )
+    return [event.kind for event in events]
+
+
+PASSED = {"distance": lambda time: 30 - 8 * time, "lateral": lambda time: 3.0}
+CAME_PAST = {"distance": lambda time: 2 + 6 * time, "lateral": lambda time: -3.5}
+
+
+def test_a_vehicle_that_leaves_or_comes_into_the_frame_passes():
+    assert kinds_on(**PASSED) == ["we_overtook"]
+    assert kinds_on(**CAME_PAST) == ["overtook_us"]
+
+
+@pytest.mark.parametrize(
+    ("path", "options"),
+    [
+        (PASSED, {"frames": 60}),  # the video ends, and the vehicle is in view
+        (PASSED, {"frames": 71}),  # the border has cut it off
+        (PASSED, {"seconds": 2.0}),  # the track ends in full view
+        ({"distance": lambda time: 15, "lateral": lambda time: -14 + 8 * time}, {}),  # crosses a junction
+        ({"distance": lambda time: 12 + 2 * time, "lateral": lambda time: -9 + 8 * time}, {}),
+        # The camera turns into the road of a vehicle ahead.
+        ({"distance": lambda time: 14 + 4 * time, "lateral": lambda time: 12 - 8 * min(time, 1.5)}, {}),
+        (PASSED, {"confidence": 0.4}),
+        (CAME_PAST, {"confidence": 0.4}),
+    ],
+)
+def test_what_does_not_pass_is_no_event(path, options):
+    passing = {"we_overtook", "overtook_us", "met", "passed"}
+    assert not passing & set(kinds_on(**path, **options))
+
+
+def test_vehicles_that_end_together_are_cut_off_by_the_next_scene():
+    one = table_on(**PASSED, seconds=2.8)
+    rows = one["frame"].astype(int)
+    both = TrackTable(
+        [*rows, *rows, 119], [*one["track_id"].astype(int), *np.full(len(rows), 2), 3],
+        [*one.boxes, *(one.boxes - np.array([500, 0, 500, 0])), [0, 0, 9, 9]],
+    )  # fmt: skip
+    assert [event.kind for event in find_events(one, fps=25, shape=SHAPE)] == ["we_overtook"]
+    assert not find_events(both, fps=25, shape=SHAPE)
+
+
+@pytest.mark.parametrize(("own_speed", "kind"), [(8.0, "passed"), (9.5, "passed"), (20.0, "we_overtook")])
+def test_a_parked_vehicle_is_not_met_where_the_own_speed_is_known(own_speed, kind):
+    assert kinds_on(**PASSED, own_speed_mps=own_speed) == [kind]
+
+
+def test_no_vehicle_closes_in_whose_stated_distance_grows():
+    near = {"distance": lambda time: 25 - 5 * time, "lateral": lambda time: 0.0}
+    assert {"closing", "hard_closing"} & set(kinds_on(**near, speed_mps=-5.0, speed_std_mps=1.0))
+    assert not {"closing", "hard_closing"} & set(kinds_on(**near, speed_mps=1.0, speed_std_mps=1.0))
+
+
+def test_the_distance_of_a_vehicle_that_the_frame_cuts_off_is_a_bound():
+    path = {"distance": lambda time: 8 - 3 * math.sin(time), "lateral": lambda time: 3.0}
+    table = table_on(**path, distance_m=path["distance"], distance_std_m=0.5)
+    events = find_events(table, fps=25, shape=SHAPE)
+    (event,) = (each for each in events if each.kind == "closest_approach")
+    assert event.is_bound
+    assert "distance at most" in str(event)
+
+
+def test_the_confidence_of_an_event_is_that_of_its_vehicle_at_most():
+    for scenario in ("passing", "cut_in", "closing"):
+        confidences = [event.confidence for event in events_of(scenario, 0)]
+        assert confidences
+        assert all(0.5 <= confidence <= 1 for confidence in confidences)
+    (event,) = find_events(table_on(**PASSED, confidence=0.7), fps=25, shape=SHAPE)
+    assert 0.6 < event.confidence <= 0.7
+
+
 def test_speeds_of_an_overtaking_vehicle_are_of_one_moment():
     seconds = np.arange(75) / 25
     distance = np.where(seconds < 0.6, 9 - 0.5 * seconds, 8.7 + 8 * (seconds - 0.6))
@@ -224,7 +317,7 @@ def test_speeds_of_an_overtaking_vehicle_are_of_one_moment():
     table = TrackTable(np.arange(25, 100), np.ones(75, int), boxes)
     speeds = np.arange(100.0)  # differ by 1 m/s from frame to frame
     (event,) = find_events(table, fps=25, shape=SHAPE, own_speed_mps=speeds)
-    assert event.kind == "overtaking"
+    assert event.kind == "overtook_us"
     # The frame is that of the least distance, the speeds are of the first certain motion away.
     assert round(event.speed_mps + event.closing_mps, 6) in speeds
     assert round(event.speed_mps + event.closing_mps) < event.frame

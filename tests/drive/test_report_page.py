@@ -377,7 +377,8 @@ def test_events_and_counts_are_listed_with_buttons_that_seek(tmp_path):
     events = [
         Event(kind="cut_in", track_id=2, frame=12, start_frame=8, end_frame=14, time_s=0.48, side="left",
               distance_m=12.5, distance_std_m=1.5),
-        Event(kind="overtaken", track_id=1, frame=40, start_frame=30, end_frame=40, time_s=1.6, side="right"),
+        Event(kind="we_overtook", track_id=1, frame=40, start_frame=30, end_frame=40, time_s=1.6,
+              side="right"),
     ]  # fmt: skip
     page = write_report(tmp_path, FRAMES, events=events)
     parser = StrictParser(page)

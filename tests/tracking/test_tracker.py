@@ -991,6 +991,13 @@ def test_arbitrary_detections_give_valid_tracks(frames, smoother):
                     assert np.linalg.eigvalsh(cov).min() > -1e-3
 
 
+@pytest.mark.parametrize("order", [slice(None), slice(None, None, -1)])
+def test_the_nearer_of_two_nested_boxes_with_equal_scores_is_tracked(order):
+    near, far = [290.0, 190, 390, 282], [320.0, 205, 360, 243]
+    (track,) = after(20, *[near, far][order]).update(found(*[near, far][order]), SHAPE)
+    np.testing.assert_allclose(track.box, near, atol=3)
+
+
 def assert_equal(first, second):
     for one, other in zip(first, second, strict=True):
         for field in dataclasses.fields(Track):

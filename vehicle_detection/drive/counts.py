@@ -13,7 +13,7 @@ from vehicle_detection._common import check_number, check_type, pluralize
 from vehicle_detection.drive.events import Event, Kind, check_events
 from vehicle_detection.tables import TrackTable
 
-COUNTED: tuple[Kind, ...] = ("met", "overtaken", "overtaking", "passed")
+COUNTED: tuple[Kind, ...] = ("met", "we_overtook", "overtook_us", "passed")
 """Kinds of events that are counted."""
 
 
@@ -24,8 +24,8 @@ class MinuteCounts:
     start_s: float
     seconds: float  # duration; the last minute may be shorter
     met: int = 0  # number of these events; see `Event`
-    overtaken: int = 0
-    overtaking: int = 0
+    we_overtook: int = 0
+    overtook_us: int = 0
     passed: int = 0
     mean_in_view: float = 0.0  # vehicles in view: the density of the traffic as the camera sees it
     max_in_view: int = 0
@@ -42,7 +42,7 @@ class VehicleCounts:
     def summary(self) -> str:
         """Describe the counts in one line, whose subject is the own vehicle."""
         total = self.total
-        counts = f"overtook {pluralize(total.overtaken, 'vehicle')}, was overtaken by {total.overtaking}"
+        counts = f"overtook {pluralize(total.we_overtook, 'vehicle')}, was overtaken by {total.overtook_us}"
         counts += f", met {total.met} oncoming"
         counts += f", passed {pluralize(total.passed, 'other')}" if total.passed else ""
         return f"{counts}; {total.mean_in_view:.1f} vehicles in view on average, {total.max_in_view} at most"

@@ -9,6 +9,7 @@ import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -30,14 +31,14 @@ from vehicle_detection._common import (
     progress_bar,
 )
 from vehicle_detection.camera import Camera
-from vehicle_detection.drive.history import split_runs, track_histories
+from vehicle_detection.drive.history import TrackHistory, split_runs, track_histories
 from vehicle_detection.drive.motion import LANE_HALF_WIDTH_M, Bools, Motion, estimate_motion
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tables import TrackTable
 from vehicle_detection.video import cut_video, open_source
 
 Kind = Literal[
-    "headway", "closest_approach", "closing", "hard_closing", "cut_in", "overtaken", "overtaking", "met",
+    "headway", "closest_approach", "closing", "hard_closing", "cut_in", "we_overtook", "overtook_us", "met",
     "passed",
 ]  # fmt: skip
 Side = Literal["left", "right"]
@@ -50,19 +51,21 @@ KINDS: dict[Kind, str] = {
     "closing": "closing in",
     "hard_closing": "closing in hard",
     "cut_in": "cut-in",
-    "overtaken": "overtaken by us",
-    "overtaking": "overtook us",
+    "we_overtook": "overtaken by us",
+    "overtook_us": "overtook us",
     "met": "met (oncoming)",
     "passed": "passed by us",
 }
 """Name of each kind of event for readers."""
 
+# Least confidence of an event that is stated: it is more likely true than not.
+_MIN_CONFIDENCE = 0.5
 # Shortest duration (s) of a track, of following a vehicle, and of being in or out of the camera's lane.
-_MIN_TRACK, _MIN_FOLLOWING, _MIN_IN_LANE = 0.5, 2.0, 0.5
+_MIN_TRACK, _MIN_FOLLOWING, _MIN_IN_LANE = 0.2, 2.0, 0.5
 # Largest relative error of a distance, a headway and a time to collision that is stated.
 _MAX_STD = 0.3
 # Largest relative error of a growth rate whose sign is certain.
-_MAX_PASSING_STD = 0.5
+_MAX_PASSING_STD = 0.6
 # Largest standard error (m/s) of a closing speed that is stated.
 _MAX_SPEED_STD = 5.0
 # Largest distance (m) of a closest approach and of a cut-in.
@@ -72,15 +75,13 @@ _CLOSING_TIME, _HARD_TIME, _HARD_DECELERATION, _MIN_CLOSING = 4.0, 2.5, 3.0, 0.3
 # Time (s) for which a vehicle is seen before and after its closest approach; else a smaller distance may have
 # been missed.
 _MIN_AROUND = 0.5
-# Longest duration (s) of a lane change, and its largest lateral speed (m/s): crossing vehicles, and all
-# vehicles while the camera turns, are faster.
+# Longest duration (s) of a lane change, and largest lateral speed (m/s) of a vehicle that changes the lane or
+# passes: crossing vehicles, and all vehicles while the camera turns, are faster.
 _LANE_CHANGE, _MAX_LATERAL_SPEED = 6.0, 3.0
-# A passing vehicle is last seen at most this long (s) before it is beside the camera, or first seen at most
-# this long after; and the least change of its size.
-_PASSING_TIME, _PASSING_RATIO = 2.5, 1.3
-# Time (s) at the start and the end of a track in which the side of the frame truncates a passing vehicle.
-_AT_SIDE_TIME = 0.3
-# Distance (m) to a passing vehicle where it is first or last seen.
+# A passing vehicle's middle leaves the frame at most this long (s) after the vehicle was last seen, or enters
+# it at most this long before it was first seen; and the least change of its distance.
+_UNSEEN_TIME, _PASSING_RATIO = 0.5, 1.15
+# Greatest distance (m) of a vehicle that comes into the frame beside the camera.
 _PASSING_M = 25.0
 # Least closing speed (m/s) of an oncoming vehicle and greatest of an overtaken one, where the own speed is
 # unknown. Faster vehicles do not cut in.
@@ -101,7 +102,7 @@ class Event:
         ``"headway"``: it was followed, at its smallest distance; ``"closest_approach"``: it was nearer than
         12 m; ``"closing"`` and ``"hard_closing"``: the time to collision was at most 4 s, and at most 2.5 s
         or the deceleration that avoids a collision at least 3 m/s²; ``"cut_in"``: it moved into the lane of
-        the camera; ``"overtaken"``, ``"overtaking"``, ``"met"``: the camera overtook it, it overtook the
+        the camera; ``"we_overtook"``, ``"overtook_us"``, ``"met"``: the camera overtook it, it overtook the
         camera, it came towards the camera; ``"passed"``: it was passed, and either stood or its direction is
         not certain.
     track_id, frame, start_frame, end_frame
@@ -111,8 +112,12 @@ class Event:
         `frame` divided by the frame rate: the time in the annotated copy, in seconds.
     side
         ``"left"`` or ``"right"`` of the camera, for vehicles that pass or cut in.
-    distance_m, distance_std_m
-        Distance at `frame` and its standard error, where the relative error is at most 0.3.
+    confidence
+        Probability that the event is true: that the track shows a vehicle, if this is known, times that of
+        what the kind states, by the standard errors. It is at least 0.5.
+    distance_m, distance_std_m, is_bound
+        Distance at `frame` and its standard error, where the relative error is at most 0.3; and whether the
+        vehicle may have been nearer, because the frame cuts its box off.
     closing_mps, closing_std_mps
         Speed of approach, negative when moving away, where its standard error is at most 5 m/s.
     headway_s, headway_std_s
@@ -121,7 +126,7 @@ class Event:
         Smallest time to collision at constant speeds, for the closing kinds.
     speed_mps
         Speed of the vehicle over ground in the camera's direction, negative when oncoming: own speed minus
-        `closing_mps`, where both are known. For ``"overtaking"`` both are those of the first frame in which
+        `closing_mps`, where both are known. For ``"overtook_us"`` both are those of the first frame in which
         it certainly moves away.
     """
 
@@ -132,8 +137,10 @@ class Event:
     end_frame: int
     time_s: float
     side: Side | None = None
+    confidence: float | None = None
     distance_m: float | None = None
     distance_std_m: float | None = None
+    is_bound: bool = False
     closing_mps: float | None = None
     closing_std_mps: float | None = None
     headway_s: float | None = None
@@ -159,6 +166,7 @@ class Event:
         )
         for name, value, std, factor, unit in listed:
             if value is not None:
+                name += " at most" * (self.is_bound and name == "distance")
                 parts.append(f"{name} {factor * value:.1f} ± {factor * (std or 0):.1f} {unit}")
         return ", ".join(parts)
 
@@ -232,12 +240,26 @@ def find_events(
         for track in histories
         if len(track.frames) >= _MIN_TRACK * rate and np.isfinite(track.boxes).all()
     ]
+    last = len(table.counts()) - 1
     events: list[Event] = []
     for motion in motions:
-        finder = _Finder(motion, rate, own_speed)
+        finder = _Finder(motion, rate, own_speed, _scene_of(motion.track, histories, last))
         events += [*finder.following(), *finder.closest(), *finder.closing(), *finder.cut_in(motions)]
-        events += finder.passing(starts_late=motion.track.first > 0.5 * rate)
-    return tuple(sorted(events, key=lambda event: (event.frame, event.track_id, event.kind)))
+        events += finder.passing()
+    stated = (event for event in events if event.confidence is None or event.confidence >= _MIN_CONFIDENCE)
+    return tuple(sorted(stated, key=lambda event: (event.frame, event.track_id, event.kind)))
+
+
+def _scene_of(track: TrackHistory, histories: Sequence[TrackHistory], last: int) -> tuple[int, int]:
+    """First and last frame of the scene: a cut is where several tracks begin or end and none goes on."""
+    others = [other for other in histories if other is not track]
+
+    def is_cut(frame: int, frames: list[int]) -> bool:
+        return frame in frames and not any(other.first < frame < other.last for other in others)
+
+    begins = is_cut(track.first, [other.first for other in others])
+    ends = is_cut(track.last, [other.last for other in others])
+    return track.first if begins else 0, track.last if ends else last
 
 
 def _check_speed(speed: float | ArrayLike | None, length: int) -> Floats:
@@ -261,6 +283,7 @@ class _Finder:
     motion: Motion
     fps: float
     own_speed: Floats  # in each frame; NaN where it is unknown
+    scene: tuple[int, int]  # its first and last frame
 
     def following(self) -> Iterable[Event]:
         """Yield each time that the vehicle was followed, at the smallest distance."""
@@ -270,7 +293,8 @@ class _Finder:
             rows = _rows(near, start, stop)
             stated = motion.track.columns["distance_m"]
             distance = np.where(np.isfinite(stated), stated, motion.distance)
-            yield self._event("headway", int(rows[np.argmin(distance[rows])]), start, stop)
+            row, certainty = int(rows[np.argmin(distance[rows])]), float(self._in_path[rows].mean())
+            yield self._event("headway", row, start, stop, certainty)
 
     def closest(self) -> Iterable[Event]:
         """Yield the closest approach, if it was near."""
@@ -278,7 +302,8 @@ class _Finder:
         if found is None or found.distance_m > _NEAR_M:
             return
         row = int(np.searchsorted(self.motion.track.frames, found.frame))
-        event = self._event("closest_approach", row, row, row + 1)
+        near = _probability(_NEAR_M - found.distance_m, found.std_m or 1.0)
+        event = self._event("closest_approach", row, row, row + 1, near)
         whole = min(seconds[row] - seconds[0], seconds[-1] - seconds[row]) >= _MIN_AROUND
         if whole and event.distance_m is not None:
             yield event
@@ -290,14 +315,19 @@ class _Finder:
         with np.errstate(invalid="ignore"):
             ahead = np.abs(motion.lateral + motion.lateral_rate * time) < LANE_HALF_WIDTH_M
             short = motion.in_path & ahead & (time > 0) & (time <= _CLOSING_TIME) & (std <= _MAX_STD * time)
+            short &= ~motion.is_cut
         for start, stop in self._runs(short, _MIN_CLOSING):
             rows = _rows(short, start, stop)
             row = int(rows[np.argmin(time[rows])])
+            speeds = motion.track.columns["speed_mps"][rows]
+            if np.isfinite(speeds).any() and np.nanmedian(speeds) > 0:  # only its box grows
+                continue
             # The largest of many estimates is too large, so each is lowered by its standard error.
             closing = motion.closing[rows] * (1 - std[rows] / time[rows])
             deceleration = float((closing**2 / (2 * motion.distance[rows])).max())
             hard = time[row] <= _HARD_TIME or deceleration >= _HARD_DECELERATION
-            yield self._event("hard_closing" if hard else "closing", row, start, stop)
+            certainty = float(self._in_path[row]) * _probability(_CLOSING_TIME - time[row], std[row])
+            yield self._event("hard_closing" if hard else "closing", row, start, stop, certainty)
 
     def cut_in(self, motions: Sequence[Motion]) -> Iterable[Event]:
         """Yield each time that the vehicle moved from another lane into that of the camera."""
@@ -320,7 +350,8 @@ class _Finder:
             inside = np.flatnonzero(np.abs(motion.lateral[begin : start + 1]) < LANE_HALF_WIDTH_M)
             row = begin + int(inside[0])
             side: Side = "right" if motion.lateral[begin] > 0 else "left"
-            yield self._event("cut_in", row, begin, start + 1, side=side)
+            certainty = float(self._in_path[start] * (1 - self._in_path[begin]))
+            yield self._event("cut_in", row, begin, start + 1, certainty, side=side)
 
     def _moved_alike(self, motions: Sequence[Motion], begin: int, end: int) -> bool:
         """Whether other vehicles moved sideways as this one did, which is a motion of the camera."""
@@ -339,75 +370,85 @@ class _Finder:
         # In the same direction, by at least half as much.
         return bool(changes) and float(np.median(changes)) / change > 0.5
 
-    def passing(self, *, starts_late: bool) -> Iterable[Event]:
+    def passing(self) -> Iterable[Event]:
         """Yield its passing where it left the frame, and its overtaking where it came into the frame."""
         motion = self.motion
         has_distance = np.isfinite(motion.distance) & (motion.distance > 0)
-        known = np.flatnonzero(np.isfinite(motion.time_to_collision) & has_distance)
-        if not known.size:
-            return
-        first, last = int(known[0]), int(known[-1])
-        yield from self._left_behind(first, last)
-        if starts_late or motion.at_side[: self._side_rows].any():
-            yield from self._came_past(first, last)
-
-    @property
-    def _side_rows(self) -> int:
-        """Number of rows of the track that `_AT_SIDE_TIME` spans."""
-        return max(int(_AT_SIDE_TIME * self.fps), 1)
+        whole = has_distance & (motion.at_side == 0)
+        known = np.flatnonzero(np.isfinite(motion.time_to_collision) & whole)
+        if known.size:
+            yield from self._left_behind(int(known[0]), int(known[-1]))
+            yield from self._came_past(int(known[0]), int(known[-1]))
 
     def _left_behind(self, first: int, last: int) -> Iterable[Event]:
-        """Yield the passing of a vehicle that is beside the camera soon after its last known row."""
-        motion = self.motion
+        """Yield the passing of a vehicle that left the frame soon after its last known row."""
+        motion, frames = self.motion, self.motion.track.frames
         time, error = motion.time_to_collision[last], motion.slope_error[last]
-        ends_at_side = motion.at_side[-self._side_rows :].any()
-        if not 0 < time <= _PASSING_TIME or error > _MAX_PASSING_STD or not self._beside(last):
-            return
-        grown = np.nanmax(motion.distance[first : last + 1]) / motion.distance[last]
-        if grown < _PASSING_RATIO or not (ends_at_side or motion.distance[last] <= _PASSING_M):
-            return
         rows = np.arange(max(first, last - round(self.fps)), last + 1)
         rows = rows[motion.time_to_collision[rows] > 0]
+        if not time > 0 or error > _MAX_PASSING_STD or not self._goes_straight(last, rows):
+            return
+        # Columns are proportional to the reciprocal distance, so that its middle reaches the border then.
+        unseen = time * (1 - motion.outward[last]) - (motion.seconds[-1] - motion.seconds[last])
+        unseen = 0.0 if motion.at_side[last:].any() else unseen
+        left = (self.scene[1] - frames[-1]) / self.fps  # time of the scene after the track
+        grown = np.nanmax(motion.distance[first : last + 1]) / motion.distance[last]
+        if grown < _PASSING_RATIO or not left or unseen > min(_UNSEEN_TIME, left):
+            return
         closing, closing_std = (float(np.median(each[rows])) for each in (motion.closing, motion.closing_std))
-        kind = self._passing_kind(closing, closing_std, int(motion.track.frames[last]))
-        yield self._event(kind, last, int(rows[0]), last + 1, side=self._side(last))
+        kind, certainty = self._passing_kind(closing, closing_std, int(frames[last]))
+        certainty *= _probability(1.0, error)
+        row, side = len(frames) - 1, self._side(last)
+        yield self._event(kind, row, int(rows[0]), row + 1, certainty, side=side, speed_row=last)
 
     def _came_past(self, first: int, last: int) -> Iterable[Event]:
         """Yield the overtaking of a vehicle that was beside the camera and then moved away."""
-        motion = self.motion
+        motion, frames = self.motion, self.motion.track.frames
         time = motion.time_to_collision
-        at_side = motion.at_side[: self._side_rows].any()
         sure = np.flatnonzero((time < 0) & (motion.slope_error < _MAX_PASSING_STD))
         near = first + int(np.nanargmin(motion.distance[first : first + max(round(self.fps), 1)]))
-        if not sure.size or not self._beside(first) or motion.distance[near] > _PASSING_M:
+        if not sure.size or motion.distance[near] > _PASSING_M:
             return
         row = int(sure[0])  # first row where its motion away is certain
-        # It was beside the camera at most _PASSING_TIME before its first known row.
-        recent = -time[row] - (motion.seconds[row] - motion.seconds[first]) <= _PASSING_TIME
+        stop = max(row, near) + 1
+        if not self._goes_straight(first, np.arange(first, stop)):
+            return
+        since = -time[row] - (motion.seconds[row] - motion.seconds[first])  # it was beside the camera
+        unseen = since * (1 - motion.outward[first]) - (motion.seconds[first] - motion.seconds[0])
+        unseen = 0.0 if motion.at_side[: first + 1].any() else unseen
         shrunk = motion.distance[last] / motion.distance[near]
-        if shrunk >= _PASSING_RATIO and (at_side or recent):
-            yield self._event(
-                "overtaking", near, first, max(row, near) + 1, side=self._side(first), speed_row=row
-            )
+        if shrunk >= _PASSING_RATIO and unseen <= min(_UNSEEN_TIME, (frames[0] - self.scene[0]) / self.fps):
+            certainty, side = _probability(1.0, motion.slope_error[row]), self._side(first)
+            yield self._event("overtook_us", near, 0, stop, certainty, side=side, speed_row=row)
 
-    def _passing_kind(self, closing: float, std: float, frame: int) -> Kind:
-        """Kind of a vehicle that left the frame: by its speed over the road, else by its closing speed."""
+    def _goes_straight(self, row: int, rows: NDArray[np.intp]) -> bool:
+        """Whether the vehicle is beside the camera's lane at a row, and does not cross the road at others."""
+        motion = self.motion
+        beside = abs(motion.lateral[row]) > 0.7 * LANE_HALF_WIDTH_M
+        rates = np.abs(motion.lateral_rate[rows])
+        rates = rates[np.isfinite(rates)]
+        return beside and (not rates.size or float(np.median(rates)) < _MAX_LATERAL_SPEED)
+
+    def _passing_kind(self, closing: float, std: float, frame: int) -> tuple[Kind, float]:
+        """Kind of a vehicle that left the frame, by its speed over the road, and the kind's certainty."""
         speed = float(self.own_speed[frame]) - closing  # over the road, in the camera's direction
         if math.isfinite(speed):
-            if abs(speed) > max(_MOVING, std):
-                return "overtaken" if speed > 0 else "met"
+            if abs(speed) > max(_MOVING, 2 * std):
+                return "we_overtook" if speed > 0 else "met", _probability(abs(speed), std)
         elif closing - std > _SLOWEST_ONCOMING:
-            return "met"
+            return "met", _probability(closing - _SLOWEST_ONCOMING, std)
         elif closing + std < _FASTEST_OVERTAKEN:
-            return "overtaken"
-        return "passed"
-
-    def _beside(self, row: int) -> bool:
-        """Whether the vehicle is not straight ahead."""
-        return bool(self.motion.at_side[row]) or abs(self.motion.lateral[row]) > 0.7 * LANE_HALF_WIDTH_M
+            return "we_overtook", _probability(_FASTEST_OVERTAKEN - closing, std)
+        return "passed", 1.0
 
     def _side(self, row: int) -> Side:
-        return "right" if (self.motion.at_side[row] or self.motion.lateral[row]) > 0 else "left"
+        return "right" if self.motion.lateral[row] > 0 else "left"
+
+    @cached_property
+    def _in_path(self) -> Floats:
+        """Probability that the vehicle is in the lane of the camera, ``(N,)``."""
+        margin = (LANE_HALF_WIDTH_M - np.abs(self.motion.lateral)) / self.motion.lateral_std
+        return np.array([_probability(each, 1.0) for each in margin.tolist()])
 
     def _runs(self, mask: Bools, seconds: float) -> list[tuple[int, int]]:
         """Half-open ranges of rows where `mask` holds for so long; gaps up to 0.25 s are closed."""
@@ -427,14 +468,21 @@ class _Finder:
         row: int,
         start: int,
         stop: int,
+        certainty: float,
         *,
         side: Side | None = None,
         speed_row: int | None = None,
     ) -> Event:
-        """Describe an event at a row, whose speeds are those at `speed_row`, by default the same."""
+        """Describe an event at a row, whose speeds are those at `speed_row`, by default the same.
+
+        `certainty` is the probability of what the kind states of a vehicle.
+        """
         motion, frames = self.motion, self.motion.track.frames
         frame, own_speed = int(frames[row]), self.own_speed[frames[row]]
-        values: dict[str, float | None] = dict.fromkeys(EVENT_COLUMNS[7:])  # those after `side`
+        values: dict[str, float] = {}
+        confidences = motion.track.columns["confidence"][start:stop]
+        if np.isfinite(confidences).any():
+            certainty *= float(np.nanmean(confidences))
         distance, std = motion.distance[row], motion.distance_std[row]
         stated = motion.track.columns["distance_m"][row], motion.track.columns["distance_std_m"][row]
         if np.isfinite(stated).all():  # as labels and tables have it
@@ -448,11 +496,11 @@ class _Finder:
             closing = motion.closing[speed_row], motion.closing_std[speed_row]
             values |= dict(zip(("closing_mps", "closing_std_mps"), closing))
             speed = self.own_speed[frames[speed_row]] - closing[0]
-            values["speed_mps"] = speed if math.isfinite(speed) else None
+            values |= {"speed_mps": speed} if math.isfinite(speed) else {}
         if kind in ("closing", "hard_closing"):
             time_to_collision = motion.time_to_collision[row], motion.time_to_collision_std[row]
             values |= dict(zip(("ttc_s", "ttc_std_s"), time_to_collision))
-        rounded = {name: None if value is None else round(float(value), 2) for name, value in values.items()}
+        rounded = {name: round(float(value), 2) for name, value in values.items()}
         return Event(
             kind=kind,
             track_id=motion.track.id,
@@ -461,8 +509,15 @@ class _Finder:
             end_frame=int(frames[stop - 1]),
             time_s=round(frame / self.fps, 3),
             side=side,
+            confidence=round(certainty, 3),
+            is_bound="distance_m" in values and bool(motion.is_cut[row]),
             **rounded,
         )
+
+
+def _probability(margin: float, std: float) -> float:
+    """Probability that a value exceeds a limit, given its estimate's margin over it and standard error."""
+    return 0.5 * (1 + math.erf(margin / std / math.sqrt(2)))
 
 
 def _rows(mask: Bools, start: int, stop: int) -> NDArray[np.intp]:
@@ -489,7 +544,7 @@ def write_events(events: Iterable[Event], path: str | os.PathLike[str]) -> int:
     >>> write_events([event], file)
     1
     >>> print(file.read_text().splitlines()[1])
-    met,3,50,40,52,2.0,,,,,,,,,,
+    met,3,50,40,52,2.0,,,,,False,,,,,,,
     """
     target = check_suffix(path, "path", EVENT_SUFFIXES)
     rows = [dataclasses.asdict(event) for event in check_events(events)]

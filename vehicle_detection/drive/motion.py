@@ -23,8 +23,8 @@ LANE_HALF_WIDTH_M = 1.8
 """Half of the width of a lane."""
 
 # Half of the span (s) of a local line, and the shortest span that gives a slope.
-_HALF_SPAN, _MIN_SPAN = 0.75, 0.5
-# Relative standard error of a box's size, and time (s) over which it is correlated.
+_HALF_SPAN, _MIN_SPAN = 0.75, 0.2
+# Least relative standard error of a box's size, and time (s) over which it is correlated.
 _SIZE_STD, _SIZE_TIME = 0.04, 0.5
 # Standard errors of the camera's heading (rad), and of the column of a vehicle's middle (m).
 _HEADING_STD, _MIDDLE_STD = math.radians(1.5), 0.3
@@ -49,6 +49,10 @@ class Motion:
     time_to_collision_std: Floats
     slope_error: Floats  # relative standard error of the rate at which the vehicle grows or shrinks
     at_side: NDArray[np.int64]  # -1 and 1 where the left and the right border of the frame truncates the box
+    is_cut: Bools  # where any border of the frame truncates the box
+    outward: (
+        Floats  # column of the box's middle: 0 at the middle of the frame, 1 at its left and right border
+    )
 
     @property
     def in_path(self) -> Bools:
@@ -78,14 +82,16 @@ def estimate_motion(track: TrackHistory, *, fps: float, shape: tuple[int, int], 
     # Both inverse sizes have the unit of the reciprocal height, so that a track may change between them.
     ratio = np.nanmedian(inverse * size) if np.isfinite(inverse * size).any() else 1.0
     inverse = np.where(np.isfinite(inverse), inverse / ratio, 1 / size)
-    value, slope, span, mean = local_lines(seconds, inverse)
+    # The border of the frame cuts the height and the outer edge of a vehicle off, too.
+    inverse, uncut = (np.where(cut_beside, np.nan, each) for each in (inverse, lateral))
+    value, slope, span, mean, scatter = local_lines(seconds, inverse)
     with np.errstate(divide="ignore", invalid="ignore"):
         time = -value / slope
         count = np.maximum(span / _SIZE_TIME, 2.0)
         # The mean of the values and the slope have independent errors, unlike the value at an end of the
         # track, so that the error of the zero is relative to its distance from the mean time (Draper and
         # Smith, *Applied Regression Analysis*, chapter 3, inverse regression).
-        mean_std = _SIZE_STD * mean / np.sqrt(count)
+        mean_std = np.maximum(_SIZE_STD * mean, scatter) / np.sqrt(count)
         slope_std = mean_std * np.sqrt(12) / span
         slope_error = slope_std / np.abs(slope)
         time_std = np.hypot(mean_std, slope_std * mean / slope) / np.abs(slope)
@@ -99,11 +105,13 @@ def estimate_motion(track: TrackHistory, *, fps: float, shape: tuple[int, int], 
         closing_std=np.hypot(scale * slope_std, closing * scale_std),
         lateral=lateral,
         lateral_std=lateral_std,
-        lateral_rate=local_lines(seconds, lateral)[1],
+        lateral_rate=local_lines(seconds, uncut)[1],
         time_to_collision=time,
         time_to_collision_std=time_std,
         slope_error=slope_error,
         at_side=truncated[:, 2].astype(np.int64) - truncated[:, 0],
+        is_cut=np.asarray(truncated.any(axis=1)),
+        outward=np.abs(track.boxes[:, [0, 2]].mean(axis=1) / (shape[1] / 2) - 1),
     )
 
 
@@ -133,19 +141,25 @@ def _lateral(
     return lateral, std
 
 
-def local_lines(seconds: Floats, values: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Straight lines through the values around each time: value, slope, span (s) and mean; NaN if unknown."""
+def local_lines(seconds: Floats, values: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Straight lines through the values around each time; NaN if unknown.
+
+    Returns the value and the slope of each, the span (s) and the mean of its values, and their standard
+    deviation from it.
+    """
     known = np.isfinite(values)
     t, y = np.where(known, seconds - seconds[0], 0.0), np.where(known, values, 0.0)
-    sums = [np.concatenate(([0.0], np.cumsum(each))) for each in (known, t, y, t * t, t * y)]
+    sums = [np.concatenate(([0.0], np.cumsum(each))) for each in (known, t, y, t * t, t * y, y * y)]
     first = np.searchsorted(seconds, seconds - _HALF_SPAN - 1e-9)
     last = np.searchsorted(seconds, seconds + _HALF_SPAN + 1e-9)
-    count, st, sy, stt, sty = (each[last] - each[first] for each in sums)
+    count, st, sy, stt, sty, syy = (each[last] - each[first] for each in sums)
     with np.errstate(divide="ignore", invalid="ignore"):
         variance = stt - st * st / count
         slope = (sty - st * sy / count) / variance
         mean = sy / count
         value = mean + slope * (seconds - seconds[0] - st / count)
         span = np.sqrt(12 * variance / count)  # of as many values, evenly spread
+        squares = syy - sy * mean - slope * (sty - st * mean)
+        scatter = np.sqrt(np.maximum(squares, 0.0) / np.maximum(count - 2, 1))
     slope = np.where((span >= _MIN_SPAN) & (count >= 3), slope, np.nan)
-    return np.where(count > 0, value, np.nan), slope, span, mean
+    return np.where(count > 0, value, np.nan), slope, span, mean, scatter

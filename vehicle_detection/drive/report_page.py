@@ -212,7 +212,7 @@ def _minute_table(counts: VehicleCounts, fps: float) -> Table:
     for minute in counts.minutes + ((counts.total,) if len(counts.minutes) > 1 else ()):
         whole = minute is counts.total
         name = "Total" if whole else format_time(minute.start_s, tenths=False)
-        numbers = minute.met, minute.overtaken, minute.overtaking, minute.passed
+        numbers = minute.met, minute.we_overtook, minute.overtook_us, minute.passed
         rows.append([name, *map(str, numbers), f"{minute.mean_in_view:.1f}", str(minute.max_in_view)])
     note = (
         "Number of vehicles in each minute. Passed by us: vehicles that stood, or whose direction is "

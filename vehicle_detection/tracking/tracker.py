@@ -387,7 +387,8 @@ class Tracker:
         if not ready:
             return
         boxes = _clip(self._states.boxes(), frame)
-        ready.sort(key=lambda row: (-tracks[row].score, boxes[row].tolist()))
+        areas = box_areas(boxes)
+        ready.sort(key=lambda row: (-tracks[row].score, -areas[row], boxes[row].tolist()))
         shown = [row for row, track in enumerate(tracks) if track.shown]
         for row in distinct_vehicles(boxes, ready, boxes[shown], self.params):
             tracks[row].id, self._next_id = self._next_id, self._next_id + 1
@@ -423,9 +424,9 @@ class Tracker:
 
 
 def _sorted_inside(detections: Detections, frame: FrameShape) -> tuple[Floats, Floats]:
-    """Boxes and scores inside the frame, best score first, independent of the order of the input."""
+    """Boxes and scores inside the frame, best score first and then the largest, in any order of the input."""
     boxes = _clip(detections.boxes.astype(np.float64), frame)
-    order = np.lexsort((*boxes.T, -detections.scores))
+    order = np.lexsort((*boxes.T, -box_areas(boxes), -detections.scores))
     order = order[(boxes[order, 2:] - boxes[order, :2] >= 1).all(axis=1)]
     return boxes[order], detections.scores[order]
 
