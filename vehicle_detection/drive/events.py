@@ -302,8 +302,8 @@ class _Finder:
         if found is None or found.distance_m > _NEAR_M:
             return
         row = int(np.searchsorted(self.motion.track.frames, found.frame))
-        near = _probability(_NEAR_M - found.distance_m, found.std_m or 1.0)
-        event = self._event("closest_approach", row, row, row + 1, near)
+        certainty = _probability(_NEAR_M - found.distance_m, found.std_m or 1.0)
+        event = self._event("closest_approach", row, row, row + 1, certainty)
         whole = min(seconds[row] - seconds[0], seconds[-1] - seconds[row]) >= _MIN_AROUND
         if whole and event.distance_m is not None:
             yield event
@@ -373,12 +373,11 @@ class _Finder:
     def passing(self) -> Iterable[Event]:
         """Yield its passing where it left the frame, and its overtaking where it came into the frame."""
         motion = self.motion
-        has_distance = np.isfinite(motion.distance) & (motion.distance > 0)
-        whole = has_distance & (motion.at_side == 0)
-        known = np.flatnonzero(np.isfinite(motion.time_to_collision) & whole)
-        if known.size:
-            yield from self._left_behind(int(known[0]), int(known[-1]))
-            yield from self._came_past(int(known[0]), int(known[-1]))
+        known = np.isfinite(motion.time_to_collision) & (motion.distance > 0) & (motion.at_side == 0)
+        if known.any():
+            first, last = np.flatnonzero(known)[[0, -1]].tolist()
+            yield from self._left_behind(first, last)
+            yield from self._came_past(first, last)
 
     def _left_behind(self, first: int, last: int) -> Iterable[Event]:
         """Yield the passing of a vehicle that left the frame soon after its last known row."""
@@ -418,16 +417,14 @@ class _Finder:
         unseen = 0.0 if motion.at_side[: first + 1].any() else unseen
         shrunk = motion.distance[last] / motion.distance[near]
         if shrunk >= _PASSING_RATIO and unseen <= min(_UNSEEN_TIME, (frames[0] - self.scene[0]) / self.fps):
-            certainty, side = _probability(1.0, motion.slope_error[row]), self._side(first)
-            yield self._event("overtook_us", near, 0, stop, certainty, side=side, speed_row=row)
+            certainty = _probability(1.0, motion.slope_error[row])
+            yield self._event("overtook_us", near, 0, stop, certainty, side=self._side(first), speed_row=row)
 
     def _goes_straight(self, row: int, rows: NDArray[np.intp]) -> bool:
         """Whether the vehicle is beside the camera's lane at a row, and does not cross the road at others."""
-        motion = self.motion
-        beside = abs(motion.lateral[row]) > 0.7 * LANE_HALF_WIDTH_M
-        rates = np.abs(motion.lateral_rate[rows])
-        rates = rates[np.isfinite(rates)]
-        return beside and (not rates.size or float(np.median(rates)) < _MAX_LATERAL_SPEED)
+        beside = abs(self.motion.lateral[row]) > 0.7 * LANE_HALF_WIDTH_M
+        crosses = np.abs(self.motion.lateral_rate[rows]) > _MAX_LATERAL_SPEED  # False where unknown
+        return bool(beside and crosses.mean() < 0.5)
 
     def _passing_kind(self, closing: float, std: float, frame: int) -> tuple[Kind, float]:
         """Kind of a vehicle that left the frame, by its speed over the road, and the kind's certainty."""
@@ -473,10 +470,7 @@ class _Finder:
         side: Side | None = None,
         speed_row: int | None = None,
     ) -> Event:
-        """Describe an event at a row, whose speeds are those at `speed_row`, by default the same.
-
-        `certainty` is the probability of what the kind states of a vehicle.
-        """
+        """Describe an event whose kind has this certainty; its speeds are those at `speed_row`."""
         motion, frames = self.motion, self.motion.track.frames
         frame, own_speed = int(frames[row]), self.own_speed[frames[row]]
         values: dict[str, float] = {}
