@@ -21,7 +21,6 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, evaluate_detections
 from vehicle_detection.features import FeatureParams
 from vehicle_detection.formats import read_labels
-from vehicle_detection.function_model import detector_from
 from vehicle_detection.heatmap import HeatParams
 from vehicle_detection.regions import RegionParams
 from vehicle_detection.scenes import SceneVehicle, render_drive, render_scene
@@ -313,17 +312,6 @@ def test_calling_it_processes_and_annotates():
         np.testing.assert_array_equal(other(frame), one.annotate(frame, result))
 
 
-def test_frames_are_left_as_they_were():
-    frame, detector = frame_with(CAR), make()
-    frame.setflags(write=False)
-    for _ in range(6):
-        picture = detector(frame)
-    np.testing.assert_array_equal(frame, frame_with(CAR))
-    assert (picture.shape, picture.dtype) == (frame.shape, np.uint8)
-    assert (picture != frame).any()
-    assert len(detector.detect(frame)) == 1
-
-
 GOOD = frame_with(CAR)
 
 
@@ -522,18 +510,6 @@ def test_an_unknown_lens_gives_a_large_error(wide_scenes):
     assert track.distance_std_m >= 0.25 * track.distance_m
 
 
-def test_a_shallow_copy_shares_the_search_and_has_its_own_tracks():
-    detector, frames = make(), drive()
-    for frame in frames[:6]:
-        detector.process(frame)
-    other = copy.copy(detector)
-    assert other.model is detector.model
-    assert other.detector is detector.detector
-    other.process(frame_with(light=200))  # a cut
-    assert detector.process(frames[6]).tracks
-    assert not other.process(frame_with(light=200)).tracks
-
-
 def test_short_descriptions():
     detector = make()
     result = detector.process(frame_with(), 0.0)
@@ -589,35 +565,6 @@ def test_boxes_have_at_least_the_confidence(scene, name):
     # The threshold does not change the probability of a box.
     best = max(everything.confidences)
     assert max(found[0.1].confidences) == pytest.approx(best, abs=1e-6)
-
-
-def test_tracks_have_a_confidence(scene):
-    with VehicleDetector(conf=0.6) as detector:
-        detector.reset(fps=10)
-        for _ in range(8):
-            result = detector.process(scene.image)
-    assert result.shown
-    for track in result.shown:
-        # The frames are alike, so the mean score is that of each detection.
-        expected = detector_probability(detector, result.detections.scores)
-        assert np.isclose(expected, track.confidence).any()
-        assert track.confidence >= 0.6
-    assert result.detections.confidences.min() >= 0.6
-
-
-def detector_probability(detector, score):
-    return 1 / (1 + np.exp(-(score + detector.model.threshold)))
-
-
-def test_confidence_of_a_function():
-    found = np.array([[10.0, 10, 50, 40], [100, 10, 150, 40]]), np.array([0.4, 0.8])
-    image = np.zeros((90, 160, 3), np.uint8)
-    for options, given in (({}, found), ({"score": "logit"}, (found[0], np.log([2 / 3, 4.0])))):
-        for threshold in ({}, {"threshold": 0.3}):
-            detector = detector_from(lambda _, given=given: given, **options, **threshold)
-            np.testing.assert_allclose(detector.detect(image).confidences[-1], 0.8, atol=1e-9)
-            assert len(detector_from(lambda _, given=given: given, conf=0.5, **options).detect(image)) == 1
-            assert len(detector_from(lambda _, given=given: given, conf=0.2, **options).detect(image)) == 2
 
 
 def test_weak_groups_of_windows_need_less_evidence():

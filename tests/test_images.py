@@ -72,14 +72,6 @@ def test_gray_becomes_three_equal_channels(picture, suffix):
         np.testing.assert_array_equal(image[..., 0], gray)
 
 
-def test_a_name_that_is_not_utf8(tmp_path):
-    path = tmp_path / os.fsdecode(b"\xff.png")
-    image = np.full((4, 5, 3), 7, np.uint8)
-    write_image(path, image)
-    assert os.listdir(os.fsencode(tmp_path)) == [b"\xff.png"]
-    np.testing.assert_array_equal(read_image(path), image)
-
-
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_sixteen_bits_are_scaled_to_eight(suffix, channels):

@@ -1,5 +1,4 @@
 import math
-import pickle
 from types import SimpleNamespace
 
 import numpy as np
@@ -130,28 +129,6 @@ def test_from_results_rejects_other_objects(results):
         TrackTable.from_results(results)
 
 
-def test_a_growing_table_can_be_pickled_and_read_in_between():
-    table = TrackTable()
-    table.append(0, 0.0, [track(1)])
-    early = table["score"]
-    for frame in range(1, 200):
-        table.append(frame, None, [track(1, score=frame)])
-    assert (early.tolist(), table["score"][-1], len(table)) == ([0.5], 199, 200)
-    copied = pickle.loads(pickle.dumps(table))
-    copied.append(200, None, [track(3)])
-    assert (list(copied.by_track()), list(table.by_track())) == ([1, 3], [1])
-    assert (table.rows(5).tolist(), table.first_time) == ([5], 0.0)
-
-
-def test_frames_that_a_live_source_dropped():
-    table = TrackTable()
-    for frame in (0, 1, 5, 6):
-        table.append(frame, frame / 10, [track(1)] if frame < 6 else [])
-    assert table.counts().tolist() == [1, 1, 1, 1, 1, 1, 0]
-    assert table.by_track()[1]["frame"].tolist() == [0, 1, 5]
-    assert TrackTable().counts().tolist() == []
-
-
 def test_times_of_frames_that_are_not_evenly_spaced():
     def times(*given_times):
         table = TrackTable()
@@ -195,11 +172,6 @@ def test_frames_that_cannot_be_appended(arguments, message):
     with pytest.raises(InvalidInputError, match=message):
         table.append(*arguments)
     assert table.frame_keys == (0,)
-
-
-def test_only_tables_that_were_empty_grow():
-    with pytest.raises(InvalidInputError, match=r"start with TrackTable\(\)"):
-        boxes_of((0, 1, CAR)).append(1)
 
 
 # --- pandas ---

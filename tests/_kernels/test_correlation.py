@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_detection._common import Workspace
 from vehicle_detection._kernels import Filter, correlation
 from vehicle_detection._kernels.vector import Block, block_adder, float_block
 
@@ -79,25 +78,6 @@ def test_products_are_added_to_the_scores_of_the_first_windows():
     assert correlation._kernel() is correlation._correlate_blocks
 
 
-def test_reused_memory_does_not_change_the_scores():
-    weights, channels = random_inputs(4, 4, 6, 12, 60)
-    workspace = Workspace()
-    first, second = np.zeros((2, 9, 57), np.float32)
-    Filter(weights).add_to(channels, first, workspace)
-    Filter(-weights).add_to(100 * channels, np.zeros((9, 57), np.float32), workspace)
-    Filter(weights).add_to(channels, second, workspace)
-    np.testing.assert_array_equal(first, second)
-
-
-def test_values_beyond_the_last_cell_are_not_used():
-    weights, channels = random_inputs(2, 2, 3, 4, 5)
-    memory = np.full((3 * 4 * 5 + 200,), np.nan, np.float32)
-    memory[: channels.size] = channels.ravel()
-    scores = np.zeros((3, 4), np.float32)
-    Filter(weights).add_to(memory[: channels.size].reshape(channels.shape), scores)
-    assert np.isfinite(scores).all()
-
-
 @pytest.mark.parametrize("depth", [1, 7])
 @pytest.mark.parametrize("block", [Block(16, 3, 8), Block(8, 2, 4), Block(4, 3, 8), Block(4, 3, 4)])
 def test_blocks_of_every_processor_add_the_same_products(block, depth):
@@ -134,13 +114,3 @@ def test_blocks_of_every_processor_add_the_same_products(block, depth):
 def test_the_processor_decides_the_blocks(features, block):
     with mock.patch("llvmlite.binding.get_host_cpu_features", return_value=features):
         assert float_block() == block
-
-
-@pytest.mark.parametrize(("name", "value"), [("CPU_NAME", "generic"), ("ENABLE_AVX", 0)])
-def test_settings_of_numba_exclude_instructions(name, value):
-    features = {"avx512f": True, "avx": True}
-    with (
-        mock.patch.object(numba.config, name, value),
-        mock.patch("llvmlite.binding.get_host_cpu_features", return_value=features),
-    ):
-        assert float_block() == Block(4, 3, 4)

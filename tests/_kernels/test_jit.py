@@ -1,5 +1,4 @@
 import errno
-import gc
 import logging
 import os
 import shutil
@@ -23,25 +22,6 @@ def test_compiling_kernels_is_logged_once_and_other_functions_are_not(caplog):
             compilation.on_start(started)
             compilation.on_end(started)
     assert [record.getMessage()[:9] for record in caplog.records] == ["compiling"]
-
-
-def test_the_garbage_collector_pauses_while_kernels_are_compiled():
-    compilation = _Compilation()
-    started = SimpleNamespace(data={"dispatcher": SimpleNamespace(py_func=value_counts.py_func)})
-    assert gc.isenabled()
-    compilation.on_start(started)
-    compilation.on_start(started)
-    compilation.on_end(started)
-    assert not gc.isenabled()
-    compilation.on_end(started)
-    assert gc.isenabled()
-    gc.disable()  # by the user
-    try:
-        compilation.on_start(started)
-        compilation.on_end(started)
-        assert not gc.isenabled()
-    finally:
-        gc.enable()
 
 
 def test_a_kernel_that_cannot_be_kept_is_used(caplog):

@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 
-from tests.cli.commands import contents, refuse, succeed
+from tests.cli.commands import contents, succeed
 from vehicle_detection.cli.demo import FILES, REPORT, SHEET, scored_truth
 from vehicle_detection.images import read_image
 from vehicle_detection.scenes import render_drive
@@ -37,12 +37,3 @@ def test_demo_scores_oncoming_vehicles():
         assert scored == replace(row, ignore=row.hard_to_see)
         assert row.ignore == (row.hard_to_see or row.speed_mps < -40)
     assert any(row.ignore and not row.hard_to_see for row in rows)
-
-
-def test_demo_refuses_bad_input(tmp_path, picture):
-    assert "--frames must be an integer at least 1" in refuse(
-        "demo", "-o", tmp_path / "a" / "b", "--frames", 0
-    )
-    assert "--seed must be" in refuse("demo", "-o", tmp_path / "a", "--seed", -1)
-    assert "--output must be a folder" in refuse("demo", "-o", picture)
-    assert contents(tmp_path) == []

@@ -101,18 +101,6 @@ def test_evaluate_names_the_files_whose_frames_differ(tmp_path):
     assert f"frame names of {found} and {labels} differ: 'out/a.jpg'" in refuse("evaluate", found, labels)
 
 
-def test_evaluate_reads_coco_results_with_their_truth(tmp_path):
-    from vehicle_detection.formats import write_labels
-    from vehicle_detection.tables import TrackTable
-
-    boxes = [[0, 0, 100, 60], [5, 0, 105, 60]]
-    write_labels(TrackTable([0, 2], [1, 1], boxes), tmp_path / "truth.json")
-    found = TrackTable([0, 2], [1, 1], boxes, score=[2.0, 1.0])
-    write_labels(found, tmp_path / "found.json", format="coco_results", truth=tmp_path / "truth.json")
-    out = succeed("evaluate", tmp_path / "found.json", tmp_path / "truth.json")
-    assert "HOTA               1.000 (DetA 1.000, AssA 1.000, LocA 1.000)" in out
-
-
 def test_evaluate_refuses_bad_input(material, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("other.csv").write_text("a,b\n1,2\n")

@@ -5,10 +5,9 @@ import sys
 
 import pytest
 
-from tests.cli.commands import contents
 from vehicle_detection._common import progress_bar
 from vehicle_detection.cli import output
-from vehicle_detection.cli.output import check_distinct_paths, output_folder, print_error, print_table
+from vehicle_detection.cli.output import check_distinct_paths, print_error, print_table
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -43,23 +42,6 @@ def test_a_table_breaks_no_word(monkeypatch, capsys, width):
     assert {word for text in words for word in text.split()} <= set(" ".join(lines).split())
     if width == 80:
         assert any("false negatives" in line for line in lines)
-
-
-def test_a_table_that_is_too_wide_is_complete(monkeypatch, capsys):
-    monkeypatch.setattr(output, "_terminal_width", lambda stream: 12)
-    print_table("t", ["a", "b"], [["0123456789", "abcdefghij"]])
-    assert set("0123456789abcdefghij") <= set(capsys.readouterr().out)
-
-
-def test_an_output_folder_with_files_is_kept(tmp_path):
-    def fill(folder):
-        with output_folder(folder, "-o"):
-            (folder.parent / "kept").touch()
-            raise ValueError("stop")
-
-    with pytest.raises(ValueError, match="stop"):
-        fill(tmp_path / "a" / "b")
-    assert contents(tmp_path) == ["a", "a/kept"]
 
 
 def test_two_names_of_a_file_are_one_file(tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 
 from tests.cli.commands import contents, patches_of, refuse, refuse_each, succeed
 from vehicle_detection.detector import load_model
-from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import write_image
 from vehicle_detection.svm import VehicleClassifier, load_classifier
 
@@ -107,15 +107,6 @@ def test_fetch_prints_the_paths_of_the_patches(monkeypatch, tmp_path):
     assert succeed("fetch", "-o", tmp_path).splitlines() == [str(tmp_path / name) for name in names]
 
 
-def test_a_failed_fetch_leaves_no_folder(monkeypatch, tmp_path):
-    def fail(output, progress):
-        raise DatasetError("the server cannot\nbe reached")
-
-    monkeypatch.setattr("vehicle_detection.fetch_patches", fail)
-    assert refuse("fetch", "-o", tmp_path / "new") == "error: the server cannot be reached\n"
-    assert contents(tmp_path) == []
-
-
 def test_info_of_the_shipped_models():
     out = succeed("info", "highway")
     model = load_classifier()
@@ -146,9 +137,3 @@ def test_info_of_a_model_with_incomplete_scores(tmp_path):
     scores = info({"splits": {"random": {"accuracy": 0.5, "test": "x"}}})
     assert re.search(r"accuracy\s+─+\s+random fifth +0\.5000", scores)
     assert "random fifth" in info({"splits": {"random": {"accuracy": 10**400}}})
-
-
-def test_info_of_a_model_with_other_metadata(tmp_path):
-    model, path = load_classifier(), tmp_path / "m.safetensors"
-    VehicleClassifier(model.params, model.templates, {"metrics": 0.5, "by": "hand", "n": {"a": 1}}).save(path)
-    assert succeed("info", path).endswith("by\n    hand\nmetrics\n    0.5\nn\n  a  1\n")

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from tests.cli.commands import contents, refuse, refuse_each, run
+from tests.cli.commands import refuse, run
 from tests.helpers import drawn, write_frame_set
 from vehicle_detection import training
 
@@ -75,22 +75,3 @@ def test_train_continue_and_show(roads, initial, tmp_path, monkeypatch):
     shown = run("info", own).stdout
     for line in r"town, before +\d\.\d{3} ", r"town +\d\.\d{3} ", r"held_out +1\n", r"steps +2\n":
         assert re.search(line, shown), line
-
-
-def test_bad_input_is_refused_before_the_training(roads, tmp_path, monkeypatch):
-    pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "empty").mkdir()
-    cases = {
-        "none -o own.onnx": "folder none does not exist; pass the folder of the labelled",
-        "empty -o own.onnx": "folder empty has no labels/NAME.csv",
-        "{roads} -o none/own.onnx": "--output needs an existing folder",
-        "{roads} -o own.safetensors": r"--output must end in \.onnx",
-        "{roads} -o own.onnx --curves own.onnx": "--curves .+ is also --output .+;",
-        "{roads} -o own.onnx --seed -1": "--seed must be an integer at least 0",
-        "{roads} -o own.onnx --steps 0": "--steps must be an integer at least 1",
-        "{roads} -o own.onnx --device tpu": "--device must be one of 'cpu', 'cuda'",
-        "{roads} -o own.onnx --model none.onnx": r"none\.onnx",
-    }
-    refuse_each("train-frames", cases, roads=roads)
-    assert contents(tmp_path) == ["empty"]

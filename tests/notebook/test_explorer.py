@@ -325,17 +325,6 @@ def test_each_control_sets_its_parameter(explorer, panel, count_searches):
     assert text.value == explorer.summary()
 
 
-def test_controls_without_effect_are_disabled(panel):
-    controls, *_ = panel
-
-    def disabled():
-        return {name for name, control in controls.items() if control.disabled}
-
-    assert disabled() == {"min. heat", "peak fraction", "heat is"}
-    controls["boxes from"].value = "heat"
-    assert disabled() == {"min. peak", "min. evidence"}
-
-
 def test_a_network_has_no_controls_for_bands_and_groups(scenes):
     explorer = Explorer(scenes)
     controls, text, _ = open_panel(explorer)

@@ -35,27 +35,5 @@ def test_the_page_says_what_happens(outcomes):
     assert bad_input_page.differences(outcomes[0], text) == []
 
 
-def test_the_page_says_of_each_kind_what_happens():
-    refused, valid = bad_input.Outcome(refused=2), bad_input.Outcome(accepted=2)
-    mixed = bad_input.Outcome(refused=1, accepted=1)
-    outcomes = {
-        "f": {"`None`": valid, "text": mixed},
-        "g": {"`None`": refused, "text": refused},
-        "`video`": {"text": mixed},
-    }
-    text = bad_input_page.page(outcomes)
-    assert "| | None | text |\n|---|---|---|\n| `f` | ok | 1 of 2 |\n\n## Commands" in text
-    assert "All kinds are errors for `g`.\n" in text
-    assert "| `video` | 1 of 2 |" in text
-    assert bad_input_page.differences(outcomes, text) == []
-    other = {"f": {"`None`": mixed}, "g": {"text": valid}, "h": {}}
-    assert bad_input_page.differences(other, text) == [
-        "`h` is not on the page",
-        "`video` is on the page, but was not called",
-        "`f`, `None`: ok on the page, but 1 of 2",
-        "`g`, text: x on the page, but ok",
-    ]
-
-
 def test_the_page_describes_all_kinds(tmp_path):
     assert list(bad_input_page.KINDS) == list(bad_input.bad_values(tmp_path))

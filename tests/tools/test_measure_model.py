@@ -5,7 +5,7 @@ import pytest
 
 from tests.helpers import drawn, write_frame_set
 from tools import measure_model
-from tools.measure_model import choose_sources, format_rows, light_of, measure
+from tools.measure_model import choose_sources, measure
 from vehicle_detection import detector_from
 from vehicle_detection.errors import DatasetError
 from vehicle_detection.evaluation import LabelledFrames
@@ -33,11 +33,6 @@ def gray(name, levels):
     return FrameDataset(name, (LabelledFrames(name, images, labels),))
 
 
-def test_the_light_of_a_frame():
-    lights = [light_of(np.full((4, 4, 3), level, np.uint8)) for level in (0, 35, 36, 71, 72, 255)]
-    assert lights == ["night", "night", "dusk", "dusk", "day", "day"]
-
-
 def test_sources_in_the_given_order_and_their_rides(data):
     assert [source.name for source in choose_sources(data, ["dawn", "bdd"])] == ["dawn", "bdd"]
     names = choose_sources(data, ["bdd"])[0].sets[0].keys
@@ -61,14 +56,6 @@ def test_a_model_is_scored_at_its_own_threshold_and_by_light():
     # Below the threshold, but found.
     (row,) = measure(model_of(0.3), sources[1:])
     assert (row["f1"], row["best_f1"], row["average_precision"]) == (0.0, 1.0, 1.0)
-
-
-def test_the_table():
-    (row,) = measure(model_of(0.9), [gray("dawn", [20])])
-    lines = format_rows([row]).splitlines()
-    cells = dict(zip(*([cell.strip() for cell in lines[number].split("|")] for number in (0, 2))))
-    assert (cells["set"], cells["frames"], cells["vehicles"], cells["F1"]) == ("dawn", "1", "1", "1.000")
-    assert (cells["truncated"], cells["on empty"]) == ("-", "-")
 
 
 def test_the_command_writes_the_values(data, tmp_path, capsys):

@@ -5,7 +5,6 @@ pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
 
 from tests.helpers import drawn
 from tools.model_card import calibration_rows, write_card
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.network import InputFormat, NetworkModel, OutputFormat
 from vehicle_detection.tables import TrackTable
@@ -63,8 +62,3 @@ def test_the_card_lists_the_measurements(tmp_path):
     assert "- us_side, 3 frames, " in card
     assert "nan" not in card
     assert max(len(line) for line in card.splitlines() if not line.startswith("|")) <= 110
-
-
-def test_the_card_needs_a_folder(tmp_path):
-    with pytest.raises(InvalidInputError, match="path needs an existing folder"):
-        write_card(tmp_path / "none" / "m.md", MODEL, [], SOURCES, seed=0)

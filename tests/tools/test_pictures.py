@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from tools import pictures
-from vehicle_detection import DetectorError, VehicleDetector, detector_from
+from vehicle_detection import DetectorError, detector_from
 from vehicle_detection.scenes import render_drive
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -33,18 +33,6 @@ class TestShipped:
         truth = [drive.truth_of(frame) for frame in frames]
         assert pictures.find_errors([RECORD["boxes"][frame] for frame in frames], truth) == []
         assert all(len(rows) >= 4 for rows in truth)
-
-    def test_the_model_finds_every_vehicle_of_single_frames(self):
-        drive = render_drive(**RECORD["scene"])
-        with VehicleDetector(jobs=1) as detector:
-            for frame in (0, len(drive) - 1):
-                scene = drive[frame]
-                assert pictures.find_errors([detector.detect(scene.image).boxes], [scene.truth]) == [], HINT
-
-    def test_they_are_small(self):
-        assert sum((DOCS / name).stat().st_size for name in pictures.FILES) < 2e6
-        with Image.open(DOCS / pictures.ANIMATION) as animation:
-            assert animation.n_frames == pictures.SCENE["frames"]
 
 
 SMALL = {"scenario": "traffic", "frames": 4, "random_state": 76, "shape": (180, 320)}
@@ -90,18 +78,3 @@ def test_pictures_with_an_error_are_not_written(tmp_path, true_boxes, change, me
     with pytest.raises(DetectorError, match=rf"{message}.*choose another random_state"):
         pictures.make_pictures(tmp_path, detector, SMALL)
     assert not list(tmp_path.iterdir())
-
-
-def test_small_changes_of_pixels_are_left_out_of_the_gif():
-    levels = [0, 8, 16, 100, 95, 5]
-    frames = [Image.fromarray(np.full((4, 6, 3), level, np.uint8)) for level in levels]
-    assert [np.unique(frame).tolist() for frame in pictures._hold_pixels(frames)] == [
-        [0], [0], [16], [100], [100], [5]
-    ]  # fmt: skip
-
-
-def test_a_vehicle_with_two_boxes_is_an_error(true_boxes):
-    truth = render_drive(**SMALL).truth
-    doubled = [[*boxes, boxes[0]] for boxes in true_boxes]
-    assert pictures.find_errors(true_boxes, truth) == []
-    assert pictures.find_errors(doubled, truth)[0] == "frame 0: 0 false and 1 missing boxes"

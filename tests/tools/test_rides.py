@@ -1,4 +1,3 @@
-from tools import rides
 from tools.rides import kept_rides
 
 NAMES = [f"ride{number}.jpg" for number in range(900)]
@@ -13,11 +12,3 @@ def test_the_kept_rides_are_two_hundred_after_the_first_and_follow_from_the_name
     assert kept_rides([*NAMES[:557], *NAMES[:556:-1]]) == kept_rides(NAMES)
     assert kept_rides(NAMES)[:2] == ["ride605.jpg", "ride875.jpg"]
     assert kept_rides(NAMES[:557]) == []
-
-
-def test_the_command_prints_the_names(tmp_path, capsys):
-    (tmp_path / "labels").mkdir()
-    rows = [f"{name},1,10,10,60,50\n" for name in NAMES]
-    (tmp_path / "labels" / "bdd.csv").write_text("frame,track,x1,y1,x2,y2\n" + "".join(rows))
-    rides.main([str(tmp_path)])
-    assert capsys.readouterr().out.splitlines() == kept_rides(NAMES)

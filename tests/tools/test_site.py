@@ -43,12 +43,6 @@ class TestMoveLinks:
     def test_other_links_stay(self, link):
         assert site_pages.move_links(f"[a]({link})", "README.md", "docs/index.md") == f"[a]({link})"
 
-    def test_moving_twice_changes_nothing(self):
-        text = (ROOT / "docs/roads.md").read_text()
-        once = site_pages.move_links(text, "docs/roads.md", "docs/roads.md")
-        assert "(models/default.md)" in once
-        assert site_pages.move_links(once, "docs/roads.md", "docs/roads.md") == once
-
 
 class TestPages:
     def test_every_public_name_has_an_entry(self):
@@ -102,16 +96,6 @@ $ vehicle-detection one [OPTIONS] {IMAGE...}... {LABELS.csv}
         assert "* `one`: Do one thing with a file, and another.\n" in tidied
         assert "$ vehicle-detection one [OPTIONS] IMAGE... LABELS.csv\n" in tidied
         assert "* `IMAGE...`: Images.\n* `LABELS.csv`: Labels.\n" in tidied
-
-    def test_writing_twice_changes_no_file(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(site_pages, "command_page", lambda: "# Command line\n")
-        times = []
-        for _ in range(2):
-            site_pages.write_pages(tmp_path)
-            times.append({path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.*")})
-        assert times[0] == times[1]
-        assert "(01_patches.ipynb)" in (tmp_path / "notebooks/index.md").read_text()
-        assert "../models/default" not in (tmp_path / "models/default.md").read_text()
 
 
 class TestLinks:

@@ -12,16 +12,6 @@ def test_a_short_run_has_a_sample_for_each_tenth():
     assert samples[-1].memory_mb < samples[0].memory_mb + 20
 
 
-def test_searched_frames_are_tracked_again():
-    samples = list(soak("highway", frames=200, length=10, shape=(180, 320), replay=True))
-    assert [sample.frames for sample in samples] == list(range(20, 201, 20))
-    assert samples[-1].memory_mb < samples[0].memory_mb + 20
-
-
-def test_steady_samples_have_no_problem():
-    assert judge([STEADY] * 10) == []
-
-
 def test_growth_slowdown_and_drift_are_named():
     changes = {
         "memory grew from 500 to 600 MB": {"memory_mb": 600.0},

@@ -1,8 +1,6 @@
 """The lock of the development environment, and licences."""
 
 import re
-from email.message import Message
-from types import SimpleNamespace
 
 import pytest
 from packaging.requirements import Requirement
@@ -48,20 +46,3 @@ def test_what_the_library_installs_states_its_licence():
     licences = {row.name: row for row in map(supply_chain.licence_of, packages)}
     assert {"numpy", "numba", "typer", "MarkupSafe"} <= set(licences)  # the last one is Jinja2's
     assert all(row.licence for row in licences.values())
-
-
-@pytest.mark.parametrize(
-    ("fields", "expected"),
-    [
-        ({"License-Expression": "MIT", "License": "text"}, "MIT"),
-        ({"Classifier": "License :: OSI Approved :: BSD License", "License": "text"}, "BSD License"),
-        ({"License": "Apache 2.0\nCopyright"}, "Apache 2.0"),
-        ({}, ""),
-    ],
-)
-def test_the_licence_of_a_package(fields, expected):
-    message = Message()
-    for name, value in {"Name": "package", **fields}.items():
-        message[name] = value
-    found = supply_chain.licence_of(SimpleNamespace(metadata=message, version="1"))
-    assert (found.name, found.licence) == ("package", expected)
