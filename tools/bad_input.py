@@ -15,6 +15,7 @@ import contextlib
 import inspect
 import itertools
 import pkgutil
+import re
 import signal
 import sys
 import tempfile
@@ -288,7 +289,7 @@ class _Valid:
             "course.": lesson,
             "LabelledFrames": {"frames": [image, image], "labels": truth},
             "LabelledFrames.from_video": {"path": clip, "labels": truth},
-            "TrackTable": {"frame": [0, 1], "track_id": np.array([1, 1])},
+            "TrackTable": {"frame": [0, 1], "track_id": np.array([1, 1]), "boxes": boxes},
             "TrackTable.from_detections": {"detections": {0: windows}},
             "TrackTable.from_pandas": {"table": predicted.to_pandas()},
             "Detections.from_supervision": {"detections": theirs},
@@ -322,21 +323,22 @@ class _Valid:
             "bounding_boxes": {"params": None},
             "calibrate_scores": {"labels": [1, 0]},
             "calibration_error": {"probabilities": [0.2, 0.5], "labels": [0, 1], "bins": 5},
-            "compare_classifiers": {"classifiers": {"a": _small_tree()}, "params": params, "jobs": 1},
             "compare_configurations": {"configurations": {"a": params}, "options": quick},
             "detector_from": {"function": lambda image: (boxes, scores)},
             "draw_labeled_bboxes": {"labels": (heat.astype(np.int32), 0)},
             "course.find_car_windows": lesson_only,
             "course.find_cars": lesson_only,
-            "course.search_windows": {**lesson_only, "color_space": "RGB", "hog_channel": 0},
+            "course.search_windows": {**lesson_only, "color_space": "RGB", "orient": 4},
             "course.draw_labeled_bboxes": {"labels": (heat.astype(np.int32), 0)},
             "course.get_hog_features": {"img": image[..., 0]},
             "estimate_horizon": {"boxes": [[40 * n, 60, 30 + 40 * n + n, 90 + n] for n in range(1, 7)]},
             "evaluate_detections": {"labels": truth},
             "evaluate_distances": {"labels": truth},
             "evaluate_tracks": {"labels": truth},
+            "count_vehicles": {"table": predicted},
             "extract_features": {"jobs": 1},
             "find_cars": {"params": search, "jobs": 1},
+            "find_events": {"table": predicted},
             "find_vehicles": {"params": None},
             "get_hog_features": {"img": image[..., 0]},
             "hog_image": {"img": image[..., 0]},
@@ -362,7 +364,6 @@ class _Valid:
                 "model": "highway",
                 "progress": False,
                 "tracks_only": True,
-                "options": {"jobs": 1},
             },
             "search_parameters": {"grid": {"orient": [4]}, "halving": Halving(n_folds=2), "options": quick},
             "search_windows": {"windows": boxes, "jobs": 1},
@@ -375,7 +376,7 @@ class _Valid:
             "write_camera": {"path": folder / "out.json"},
             "write_image": {"path": folder / "out.png"},
             "write_labels": {"labels": truth},
-            "write_subtitles": {"path": folder / "out.srt"},
+            "write_subtitles": {"table": predicted, "path": folder / "out.srt"},
             "write_tracks": {"results": predicted},
             "notebook.plot_errors": {"frames": frames},
             "notebook.plot_explanation": {"explanation": vd.explain(detector, image, boxes[0])},
@@ -395,12 +396,23 @@ def _table() -> Any:
                          "configuration": ["a", "b"]})  # fmt: skip
 
 
-def _small_tree() -> Any:
-    """Return a classifier of scikit-learn that trains quickly."""
-    from sklearn.tree import DecisionTreeClassifier
+_OTHER_NAMES = {
+    "clf": "classifier", "cost": "column", "X_scaler": "scaler", "svc": "classifier", "by": "column",
+    "frames": "frame", "label": "column", "n_frames": "frames", "parameter": "column", "path": "file|folder",
+    "quality": "column", "configurations": "configuration|preset", "image": "path",
+    "patches": "image file", "windows": "boxes", "X": "source",
+}  # fmt: skip
+"""What the error of a bad argument may name instead."""
 
-    return DecisionTreeClassifier(max_depth=1)
 
+def _names(argument: str, text: str, error: BaseException) -> bool:
+    """Whether an error names the argument; those of other arguments come first in some functions."""
+    names = f"{argument}|{_OTHER_NAMES.get(argument, argument)}"
+    return bool(re.search(rf"\b({names})\b", str(error))) or text.startswith(_ALSO_OTHER_ERRORS)
+
+
+_ALSO_OTHER_ERRORS = ("TrackTable.append(", "course.bin_spatial(size", "course.draw_labeled_bboxes(img")
+"""Calls whose error may be that of another argument, which the bad one contradicts."""
 
 _KEEPS_FILES = "tune --cache "
 """Start of the texts of calls whose files stay after an error: what is cached saves time the next time."""
@@ -415,13 +427,16 @@ class Outcome:
     problems: list[str] = field(default_factory=list)
 
     def add(self, text: str, error: BaseException | None, written: set[str]) -> None:
-        """Add a call, its error and the files that it wrote."""
+        """Add a call, such as ``"f(x=None)"``, its error and the files that it wrote."""
         if error is None:
             self.accepted += 1
         elif isinstance(error, VehicleDetectionError):
             self.refused += 1
             if written and not text.startswith(_KEEPS_FILES):
                 self.problems.append(f"{text}: failed, but left {sorted(written)}")
+            argument = re.match(r"[\w.]+\((\w+)=", text)
+            if argument and not _names(argument[1], text, error):
+                self.problems.append(f"{text}: does not name the argument: {error}"[:200])
         else:
             self.problems.append(f"{text}: {' '.join(f'{type(error).__name__}: {error}'.split())[:150]}")
 

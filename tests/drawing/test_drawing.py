@@ -269,8 +269,6 @@ FOUND = Detections([[600, 400, 700, 490]], [1.25])
     ("draw", "message"),
     [
         (lambda: draw_boxes(np.zeros((5, 5, 3)), []), r"image must be an \(H, W, 3\) uint8 RGB array"),
-        (lambda: draw_boxes(blank(), [[1, 2, 3]]), r"boxes must be an \(N, 4\) number array"),
-        (lambda: draw_boxes(blank(), [], thickness=0), "thickness must be an integer from 1 to 10000"),
         (lambda: draw_boxes(blank(), [], color="blue"), r"color must be \(red, green, blue\), 0-255 each"),
         (lambda: draw_boxes(blank(), [], color=(0, 0, 256)), "color must be an integer from 0 to 255"),
         (lambda: draw_labeled_bboxes(blank(), np.zeros((720, 1280), int)), "scipy.ndimage.label returns"),
@@ -278,10 +276,7 @@ FOUND = Detections([[600, 400, 700, 490]], [1.25])
             (lambda labels=labels: draw_labeled_bboxes(blank(), (labels, 0)), r"labels\[0\] must be integers")
             for labels in (np.zeros((9, 9), int), np.zeros((720, 1280)))
         ),
-        (lambda: draw_detections(blank(), [[600, 400, 700, 490]]), "detections must be a Detections"),
-        (lambda: draw_detections(blank(), FOUND, line_width=0), "line_width must be an integer from 1"),
         (lambda: blur_boxes(NOISE, [], region="faces"), "region must be one of 'vehicles', 'plates'"),
-        (lambda: blur_boxes(NOISE[..., 0], []), "image must be"),
     ],
 )
 def test_malformed_arguments_are_refused(draw, message):

@@ -125,13 +125,9 @@ def test_calibration_error_lies_between_0_and_1(pairs, bins):
     ("probabilities", "labels", "bins", "message"),
     [
         ([], [], 15, "probabilities must be a one-dimensional array"),
-        ([1.5], [1], 15, "probabilities must be .* from 0 to 1"),
-        ([math.nan], [1], 15, "probabilities must be"),
         ([[0.5]], [1], 15, "probabilities must be a one-dimensional"),
-        (["a"], [1], 15, "probabilities must be"),
         ([0.5], [1, 0], 15, "labels must be 0 or 1 for each of the 1 probabilities"),
         ([0.5], [-1], 15, "labels of -1 and 1 convert with labels > 0"),
-        ([0.5], [1], 0, "bins must be an integer from 1 to 1000000"),
     ],
 )
 def test_invalid_arguments_of_calibration_error(probabilities, labels, bins, message):

@@ -146,11 +146,8 @@ def test_a_detected_box_of_a_track_is_explained(detector, tmp_path, seconds, fra
     [
         ({"box": [1, 2, 3]}, "box must be an"),
         ({"box": [10, 10, 10, 20]}, r"box must be \[x1, y1, x2, y2\], 1 pixel or larger"),
-        ({"box": [[1, 2, 3, 4]] * 2}, "box must be"),
         ({"box": [30, 20, 10, 40]}, "box must be .* with x1 <= x2"),
         ({"box": [700, 0, 760, 60]}, "box must lie in the image of 640x360 pixels"),
-        ({"image": SCENE.image[..., 0]}, "image must be"),
-        ({"detector": "default"}, "detector must be a Detector or VehicleDetector"),
         ({"detector": VehicleDetector(NO_MODEL)}, "detector must have a network or a classifier of"),
     ],
 )

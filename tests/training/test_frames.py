@@ -18,9 +18,7 @@ from vehicle_detection.training import FrameDataset, check_sources, find_sources
     ("changes", "message"),
     [
         ({"name": ""}, "name must be a non-empty string, got ''"),
-        ({"name": 5}, "name must be a non-empty string"),
         ({"sets": ()}, "sets must be a tuple of at least one entry"),
-        ({"sets": None}, "sets must be a tuple of at least one entry; got None"),
         ({"sets": ("road",)}, "sets must be a LabelledFrames, got 'road'"),
     ],
 )

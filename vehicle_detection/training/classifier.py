@@ -249,6 +249,7 @@ def _fit_estimator(
     except InvalidInputError as error:
         raise InvalidInputError(
             f"estimator must be a linear classifier, such as LinearSVC; got {describe(estimator)}. "
-            "compare_classifiers trains any classifier, and vehicle_detection.course searches with it"
+            "PatchFeatures in a pipeline of scikit-learn trains any classifier, and vehicle_detection.course "
+            "searches with it"
         ) from error
     return Template(template.mean, template.scale / gains, template.coef, template.intercept)

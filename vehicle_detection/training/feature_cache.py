@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import atomic_write, check_number, check_patches, check_path, check_type
-from vehicle_detection.datasets import PatchSet
+from vehicle_detection._common import atomic_write, check_number, check_patches, check_path
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE, FeatureParams, extract_features
 
@@ -131,17 +130,3 @@ class FeatureCache:
                         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
                     raise
         return features
-
-
-def open_cache(
-    patch_set: PatchSet, cache: FeatureCache | str | os.PathLike[str] | None, jobs: int | None
-) -> FeatureCache:
-    """Return the cache of a folder or in memory, or `cache` itself if it is one of these patches."""
-    check_type(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
-    if not isinstance(cache, FeatureCache):
-        return FeatureCache(patch_set.patches, folder=cache, jobs=jobs)
-    if cache.patches is not patch_set.patches:
-        raise InvalidInputError(
-            "cache must be a FeatureCache of the patches of patch_set; make one from patch_set.patches"
-        )
-    return cache

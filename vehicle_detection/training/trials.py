@@ -27,7 +27,7 @@ from vehicle_detection.search import SearchParams
 from vehicle_detection.svm import VehicleClassifier
 from vehicle_detection.tables import TrackTable
 from vehicle_detection.training.classifier import DEFAULT_C, TrainingOptions, check_labels, fit_features
-from vehicle_detection.training.feature_cache import FeatureCache, digest_of, open_cache
+from vehicle_detection.training.feature_cache import FeatureCache, digest_of
 from vehicle_detection.training.results import RowStore, make_table, number_or_text
 
 if TYPE_CHECKING:
@@ -233,13 +233,21 @@ class Trials:
     def __init__(self, patch_set: PatchSet, options: TrialOptions | None, store: RowStore) -> None:
         options = TrialOptions() if options is None else options
         check_type(options, "options", TrialOptions, "omit it for the defaults")
-        self.cache = open_cache(patch_set, options.cache, options.jobs)
+        check_type(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
+        cache = options.cache
+        if not isinstance(cache, FeatureCache):
+            cache = FeatureCache(patch_set.patches, folder=cache, jobs=options.jobs)
+        elif cache.patches is not patch_set.patches:
+            raise InvalidInputError(
+                "cache must be a FeatureCache of the patches of patch_set; make one from patch_set.patches"
+            )
+        self.cache = cache
         self.labels = patch_set.labels.astype(np.int64)
         self.bar: Any = None  # progress bar of rows
         self._options, self._store = options, store
         self._rows: list[Mapping[str, Any]] = []
         self._search_ms: dict[FeatureParams, float] = {}
-        self._patches_digest = digest_of(self.cache.digest, self.labels)
+        self._patches_digest = digest_of(cache.digest, self.labels)
         used: dict[str, Any] = {}
         if options.time_search or options.frame_sets:
             used["search"] = dataclasses.asdict(options.search_params)

@@ -1,4 +1,4 @@
-"""Comparison of configurations and of classifiers on splits, and the search of a grid by successive halving.
+"""Comparison of configurations on splits, and the search of a grid by successive halving.
 
 Every trial is one row of a table. With a store, each row is on disk as soon as it is measured, so an
 interrupted run continues where it stopped, and a run with more configurations measures only the new ones.
@@ -30,10 +30,8 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.datasets import SEEDED_SPLITS, SPLIT_NAMES, PatchSet, Split, make_split
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import FeatureParams
-from vehicle_detection.training.classifier import DEFAULT_C, check_labels
-from vehicle_detection.training.feature_cache import FeatureCache, open_cache
-from vehicle_detection.training.results import RowStore, make_table
+from vehicle_detection.training.classifier import DEFAULT_C
+from vehicle_detection.training.results import RowStore
 from vehicle_detection.training.trials import (
     COLUMNS,
     Candidate,
@@ -326,109 +324,3 @@ def check_seeds(seeds: object) -> tuple[int, ...]:
             f"seeds must be a list of different integers, such as range(5); got {describe(seeds)}"
         )
     return checked
-
-
-def compare_classifiers(
-    patch_set: PatchSet,
-    classifiers: Mapping[str, Any] | None = None,
-    *,
-    params: FeatureParams | None = None,
-    splits: str | Sequence[str] | Mapping[str, Split] = "sequences",
-    seeds: Sequence[int] = (0,),
-    cache: FeatureCache | str | os.PathLike[str] | None = None,
-    jobs: int | None = None,
-    progress: bool = False,
-) -> DataFrame:
-    """Train and evaluate classifiers of scikit-learn on the same features and splits.
-
-    The features are scaled by a ``StandardScaler`` that is fitted on the training part, as in the course.
-
-    Returns one row for each classifier and split, with the columns ``classifier``, ``split``, ``seed``,
-    ``train_size`` and ``test_size`` (patches), ``accuracy``, ``false_negative_rate``,
-    ``false_positive_rate``, ``fit_seconds`` and ``predict_seconds`` (of all test patches).
-
-    Parameters
-    ----------
-    patch_set, params
-        The patches and the features, by default ``FeatureParams()``.
-    classifiers
-        Estimators of scikit-learn by name; they are copied, not changed. None compares Gaussian naive Bayes
-        with a linear SVM.
-    splits, seeds, progress
-        As in `compare_configurations`.
-    cache, jobs
-        As in `TrialOptions`.
-
-    Examples
-    --------
-    >>> from sklearn.tree import DecisionTreeClassifier
-    >>> from sklearn.naive_bayes import GaussianNB
-    >>> from vehicle_detection import render_patches
-    >>> patches, labels = render_patches(60)
-    >>> patch_set = PatchSet(patches, labels, [f"drawn/{number}.png" for number in range(60)])
-    >>> models = {"naive Bayes": GaussianNB(), "tree": DecisionTreeClassifier(random_state=0)}
-    >>> table = compare_classifiers(patch_set, models, splits="random", seeds=range(2))
-    >>> table["classifier"].tolist()
-    ['naive Bayes', 'naive Bayes', 'tree', 'tree']
-    """
-    from sklearn.model_selection import cross_validate
-    from sklearn.naive_bayes import GaussianNB
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-    from sklearn.svm import LinearSVC
-
-    default = {"naive Bayes": GaussianNB(), "linear SVM": LinearSVC(C=DEFAULT_C, random_state=0)}
-    models = _check_classifiers(default if classifiers is None else classifiers)
-    chosen = FeatureParams() if params is None else params
-    check_type(chosen, "params", FeatureParams, "pass FeatureParams() or a preset")
-    X, labels = open_cache(patch_set, cache, jobs).all(chosen), patch_set.labels.astype(np.int64)
-    trials = list(make_splits(patch_set, splits, check_seeds(seeds)))
-    for _, _, split in trials:
-        check_labels(labels[split.train], len(split.train))
-    rows = []
-    with progress_bar(progress, len(models), unit="classifier") as bar:
-        for name, model in models.items():
-            scores = cross_validate(
-                make_pipeline(StandardScaler(), model),
-                X,
-                labels,
-                cv=[tuple(split) for _, _, split in trials],
-                scoring=_score_classifier,
-                error_score="raise",
-            )
-            for number, (split_name, seed, split) in enumerate(trials):
-                row = {"classifier": name, "split": split_name, "seed": seed}
-                row |= {"train_size": len(split.train), "test_size": len(split.test)}
-                row |= {key: scores[f"test_{key}"][number] for key in _ERROR_RATES}
-                row["fit_seconds"] = round(float(scores["fit_time"][number]), 3)
-                row["predict_seconds"] = round(float(scores["score_time"][number]), 3)
-                rows.append(row)
-            bar.update()
-    return make_table(rows)
-
-
-_ERROR_RATES = ("accuracy", "false_negative_rate", "false_positive_rate")
-
-
-def _score_classifier(model: Any, X: NDArray[np.float32], y: NDArray[np.int64]) -> dict[str, float]:
-    """Values of `_ERROR_RATES`; NaN without patches of the class."""
-    wrong = np.asarray(model.predict(X)) != y
-    rates = [float(wrong[y == label].mean()) if (y == label).any() else math.nan for label in (1, 0)]
-    return dict(zip(_ERROR_RATES, (float(1 - wrong.mean()), *rates)))
-
-
-def _check_classifiers(classifiers: Mapping[str, Any]) -> dict[str, Any]:
-    given: object = classifiers
-    if not isinstance(given, Mapping) or not given:
-        raise InvalidInputError(
-            "classifiers must map names to estimators of scikit-learn, at least one, such as "
-            f"{{'naive Bayes': GaussianNB()}}; got {describe(given)}"
-        )
-    needed = ("fit", "predict", "get_params")  # the last one for `sklearn.base.clone`
-    for name, model in given.items():
-        if isinstance(model, type) or not all(hasattr(model, each) for each in needed):
-            raise InvalidInputError(
-                f"classifiers[{name!r}] must be an estimator with fit, predict and get_params, got "
-                f"{describe(model)}; pass an instance, such as GaussianNB()"
-            )
-    return {str(name): model for name, model in given.items()}
