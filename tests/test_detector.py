@@ -14,7 +14,7 @@ import vehicle_detection
 from tests.helpers import ROOT
 from vehicle_detection.annotator import Annotator, DrawParams
 from vehicle_detection.boxes import iou_matrix
-from vehicle_detection.camera import Camera, open_camera, write_camera
+from vehicle_detection.camera import Camera, write_camera
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import Detector, VehicleDetector, load_model
 from vehicle_detection.errors import InvalidInputError
@@ -445,23 +445,6 @@ def test_a_tracker_accepts_detections_of_supervision():
     assert 1 < tracks[0].score < np.log(9)  # rising from 0
 
 
-def track_cars(scenes, **options):
-    """Tracks of one car each, with a detector per scene, and the last detector."""
-    tracks = []
-    for scene in scenes:
-        with VehicleDetector(**options) as detector:
-            detector.reset(fps=10)
-            for _ in range(8):
-                result = detector.process(scene.image)
-        tracks += result.shown
-    assert len(tracks) == len(scenes)
-    return tracks, detector
-
-
-def median_distance(tracks):
-    return float(np.median([track.distance_m for track in tracks]))
-
-
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda each: pickle.loads(pickle.dumps(each))])
 @pytest.mark.parametrize("regions", ["fitted", "heat"])
 def test_a_copy_continues_the_tracks(copied, regions):
@@ -473,37 +456,6 @@ def test_a_copy_continues_the_tracks(copied, regions):
     for frame in frames[6:]:
         expected, found = detector.process(frame), copy_of_it.process(frame)
         assert [str(each) for each in found.tracks] == [str(each) for each in expected.tracks]
-
-
-@pytest.fixture(scope="module")
-def wide_scenes():
-    # The distance of one car depends on a pixel of its box: several cars.
-    cars = [SceneVehicle(distance_m=9.0, kind=kind) for kind in ("sedan", "hatchback", "mpv")]
-    return [
-        render_scene(vehicles=[car], lane=1, focal_px=640.0, camera_height_m=1.5, random_state=2)
-        for car in cars
-    ]
-
-
-def test_a_known_lens_gives_the_distance(wide_scenes, tmp_path):
-    tracks, detector = track_cars(wide_scenes, camera=Camera.dashcam(fov=90, height_m=1.5, horizon=0.56))
-    assert detector.camera.lens_is_known
-    true = float(np.median([scene.truth[0].distance_m for scene in wide_scenes]))
-    assert median_distance(tracks) == pytest.approx(true, rel=0.1)
-    assert all(track.distance_std_m < 0.2 * track.distance_m for track in tracks)
-    write_camera(wide_scenes[0].camera, tmp_path / "camera.json", (720, 1280))
-    tracks, detector = track_cars(wide_scenes, camera=tmp_path / "camera.json")
-    assert detector.camera.lens_is_known
-    assert median_distance(tracks) == pytest.approx(true, rel=0.1)
-    tracks, _ = track_cars(wide_scenes, camera=open_camera("wide-90", height_m=1.5))
-    assert median_distance(tracks) == pytest.approx(true, rel=0.2)
-
-
-def test_an_unknown_lens_gives_a_large_error(wide_scenes):
-    ((track,), detector) = track_cars(wide_scenes[:1])
-    assert not detector.camera.lens_is_known
-    assert track.distance_m > 1.3 * 9.0
-    assert track.distance_std_m >= 0.25 * track.distance_m
 
 
 def test_short_descriptions():

@@ -23,9 +23,7 @@ from vehicle_detection.features import (
     get_hog_features,
     hog_blocks,
     hog_image,
-    part_slices,
     single_img_features,
-    sum_blocks,
 )
 from vehicle_detection.images import decode_image, write_image
 
@@ -331,26 +329,3 @@ def test_convert_color(color_space):
     ):
         with pytest.raises(InvalidInputError, match=message):
             convert_color(*arguments)
-
-
-def test_parts_lie_one_after_another():
-    params = FeatureParams(spatial_size=(32, 32), hist_bins=32, orient=9, hog_channel="ALL", coarse_hog=True)
-    assert part_slices(params) == {
-        "spatial bins": slice(0, 3072),
-        "color histogram": slice(3072, 3168),
-        "HOG": slice(3168, 8460),
-        "coarse HOG": slice(8460, 9432),
-    }
-
-
-@pytest.mark.parametrize("side", [1, 2, 3])
-def test_blocks_are_summed_over_the_cells_that_they_share(side):
-    blocks = np.random.default_rng(0).normal(size=(4, 5, side, side, 9))
-    sums = sum_blocks(blocks)
-    expected = np.zeros((4 + side - 1, 5 + side - 1, 9))
-    for (down, across, row, column), values in np.ndenumerate(blocks[..., 0]):
-        expected[down + row, across + column, 0] += values
-    assert sums.shape == expected.shape
-    np.testing.assert_allclose(sums[..., 0], expected[..., 0])
-    counts = sum_blocks(np.ones_like(blocks))
-    assert (counts[0, 0, 0], counts.max()) == (1, side**2)

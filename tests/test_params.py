@@ -80,13 +80,6 @@ def test_invalid_parameters_are_rejected(kind, arguments, message):
         kind(**arguments)
 
 
-def test_the_color_spaces_of_the_parts():
-    params = FeatureParams(color_space="LUV", hist_color_space="HSV", spatial_feat=False)
-    assert (params.spatial_space, params.hist_space) == ("LUV", "HSV")
-    assert params.used_color_spaces == {"LUV", "HSV"}
-    assert FeatureParams(hog_channel="GRAY", spatial_color_space="HLS").used_color_spaces == {"HLS", "YCrCb"}
-
-
 def test_a_band_is_relative_to_the_horizon():
     assert SearchParams(bands=[BAND], horizon=0.5) == SEARCH
     assert SEARCH.with_horizon(None) is SEARCH
@@ -117,13 +110,6 @@ def test_bands_without_room_for_a_window_are_omitted():
     assert len(SearchParams(bands=(low, BAND), horizon=0.5).place((720, 1280))) == 1
     narrow = SearchBand(window=(64, 64), y=(0, 256), x=(0.5, 0.52))
     assert len(SearchParams(bands=(narrow, BAND), horizon=0.5).place((720, 1280))) == 1
-
-
-def test_padding_is_added_at_the_frames_borders_only():
-    left = SearchBand(window=(64, 64), y=(0, 256), x=(0, 0.5))
-    right = SearchBand(window=(64, 64), y=(0, 256), x=(0.5, 1))
-    bands = SearchParams(bands=(BAND, left, right), horizontal_padding=0.25).place((720, 1280))
-    assert [(band.x1, band.x2) for band in bands] == [(-16, 1296), (-16, 640), (640, 1296)]
 
 
 sizes = st.floats(16, 400)

@@ -3,11 +3,10 @@
 import ast
 import subprocess
 import sys
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 
 import vehicle_detection
 from tests.helpers import ROOT
-from vehicle_detection.drive import trips
 
 FOLDER = Path(vehicle_detection.__file__).parent
 
@@ -140,10 +139,3 @@ def test_text_files_have_the_same_line_breaks_everywhere():
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
                 named = {keyword.arg for keyword in node.keywords}
                 assert node.func.attr != "write_text" or "newline" in named, f"{path.name} {node.lineno}"
-
-
-def test_paths_of_windows_are_grouped_by_their_folders(monkeypatch):
-    monkeypatch.setattr(trips, "PurePath", PureWindowsPath)
-    names = [rf"C:\{folder}\GX{chapter}0042.MP4" for folder in ("A", "B") for chapter in ("02", "01")]
-    found = trips.find_trips(names)
-    assert [trip.files for trip in found] == [(names[1], names[0]), (names[3], names[2])]

@@ -29,7 +29,6 @@ from tests.helpers import ROOT
 from tests.video.clips import gray_frames, write_clip
 from vehicle_detection import detector
 from vehicle_detection._kernels.jit import jit
-from vehicle_detection.cli.signals import raise_on_signals
 from vehicle_detection.drive import events
 from vehicle_detection.images import write_image
 from vehicle_detection.scenes import render_scene
@@ -134,18 +133,6 @@ def test_an_early_interrupt_has_no_traceback(delay):
     assert (status, errors) in ((130, "interrupted\n"), (0, ""))
 
 
-def test_an_interrupt_while_the_commands_are_imported():
-    code = """
-import os, signal, sys
-class Interrupt:
-    def find_spec(self, name, *rest):
-        if name == "typer":
-            os.kill(os.getpid(), signal.SIGINT)
-sys.meta_path.insert(0, Interrupt())
-"""
-    assert finish(start_changed(code)) == (130, "", "interrupted\n")
-
-
 def test_an_interrupt_after_a_command_changes_nothing():
     code = "import atexit, os, signal; atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))"
     status, out, errors = finish(start_changed(code, "info"))
@@ -169,17 +156,6 @@ training.train_and_evaluate = train
     process = start_paused(code, "train", *patches_of(tmp_path), "-o", tmp_path / "x.safetensors")
     process.send_signal(signal.SIGTERM)
     assert finish(process) == (143, "", "interrupted\n")
-
-
-def test_an_ignored_signal_stays_ignored():
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
-    try:
-        with raise_on_signals():
-            assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
-            assert signal.getsignal(signal.SIGTERM) != signal.SIG_DFL
-        assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
-    finally:
-        signal.signal(signal.SIGHUP, before)
 
 
 # --- outputs that cannot be written ---

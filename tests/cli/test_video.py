@@ -60,18 +60,6 @@ def test_video_takes_the_camera(tmp_path):
     assert ratios == pytest.approx([1.0] * len(ratios), rel=0.02)
 
 
-def test_video_warns_of_a_wrong_horizon(clip, tmp_path, monkeypatch):
-    found = HorizonEstimate(horizon=0.551, horizon_std=0.012, camera_height_m=1.3, n_boxes=40)
-    monkeypatch.setattr(video, "estimate_video_horizon", lambda *_, **__: found)
-    words = ["video", clip, "-o", tmp_path / "out.mp4", "--end", 0.12, "--model", "highway"]
-    result = run(*words, "--horizon", 0.95)
-    assert "warning: no vehicle was found with --horizon 0.95, but a search of all rows" in result.stderr
-    camera = tmp_path / "camera.json"
-    camera.write_text('{"fov": 58, "horizon": 0.95}')
-    result = run(*words, "--camera", camera)
-    assert f"warning: no vehicle was found with the horizon of --camera {camera}, but" in result.stderr
-
-
 def test_video_writes_an_annotated_copy_and_tracks(clip, tmp_path):
     target, tracks = tmp_path / "out.mp4", tmp_path / "tracks.csv"
     out = succeed("video", clip, "-o", target, "--tracks", tracks, "--preset", "ultrafast", "--profile")

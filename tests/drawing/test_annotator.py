@@ -196,14 +196,6 @@ class TestPosition:
         assert position.distance_m == distance
         assert abs(position.lateral_m - lateral) < 0.35
 
-    @pytest.mark.parametrize(("left", "sign"), [(790, 1), (0, -1)])
-    def test_where_the_frame_truncates_the_near_end(self, left, sign):
-        """The visible far end of the side gives the position: here 4.5 m behind the near end, at 150 px."""
-        known = track((left, 380, left + 490, 600), distance_m=4.0, distance_std_m=0.5)
-        assert road_position(known, CAMERA, SHAPE).lateral_m == pytest.approx(
-            sign * (0.150 * 8.5 + CAMERA.vehicle_width_m / 2)
-        )
-
 
 class TestPanel:
     def test_trails_cover_a_time_and_drop_lost_tracks(self):
@@ -242,13 +234,6 @@ class TestPanel:
             assert (top, right) == (0, shape[1])
             assert (bottom, right - left) == BirdsEyePanel.corner_size(shape)
             assert bottom < 0.45 * shape[0]
-
-    def test_distances_in_feet(self):
-        """Lines at 75, 150 and 225 ft instead of 20, 40 and 60 m."""
-        drawn = Annotator(DrawParams(panel="side", labels=(), units="imperial")).draw_tracks(blank(), [])
-        lines = [round((80 - feet * 0.3048) * 720 / 86) for feet in (75, 150, 225)]
-        rows = (drawn[:, -4:] == drawn[lines[0], -4:]).all(axis=(1, 2))
-        assert np.flatnonzero(rows).tolist() == sorted(lines)
 
     def test_a_vehicle_is_at_its_place(self):
         """A vehicle in the own lane: in the middle, and the farther the higher."""

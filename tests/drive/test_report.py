@@ -53,14 +53,6 @@ def test_no_piece_of_a_page_holds_the_whole_video(tmp_path, monkeypatch):
     assert max(sizes) < 20_000
 
 
-def test_matroska_comes_with_a_note(tmp_path):
-    video = tmp_path / "video.MKV"
-    video.write_bytes(b"video")
-    text = write_report(tmp_path, FRAMES, video=video)
-    assert 'type="video/x-matroska"' in text
-    assert "Not every browser plays Matroska" in text
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -13,7 +13,6 @@ from vehicle_detection.drive.report_charts import (
     ValueAxis,
     _assign_rows,
     _separate_labels,
-    chart,
     format_time,
 )
 
@@ -33,12 +32,6 @@ def test_a_value_axis_covers_its_values_with_round_ticks(one, other, integers):
     assert axis.y(axis.high) == 0
     if integers:
         assert all(tick == round(tick) for tick in axis.ticks)
-
-
-def test_value_axes_of_single_values():
-    assert ValueAxis.covering(0, 0, 70, integers=True).ticks == (0, 1)
-    assert ValueAxis.covering(0, 1, 70, integers=True, max_steps=3).ticks == (0, 1)
-    assert ValueAxis.covering(0, 38.4, 150).ticks == (0, 10, 20, 30, 40)
 
 
 @given(st.integers(1, 2_000_000), st.sampled_from([5.0, 25.0, 29.97, 60.0]))
@@ -63,12 +56,6 @@ def test_labels_do_not_overlap(places):
         assert label.x == x
         assert abs(label.y - min(max(y, 13), 148)) <= 1.5 * 13
     assert len({label.track for label in kept}) == len(kept)
-
-
-def test_a_label_has_the_color_of_its_track():
-    labels = [Label(50.0, 40.0, 9)]
-    svg = chart("", TimeAxis(50, 25.0), ValueAxis.covering(0, 10, 150), label="Lines", names=labels)
-    assert 'class="track-name c1"' in svg
 
 
 @given(PRESENCE)

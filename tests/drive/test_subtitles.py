@@ -126,13 +126,3 @@ def test_bad_arguments_are_refused(changes, message, tmp_path):
     with pytest.raises(InvalidInputError, match=message):
         write_subtitles(options.pop("table"), tmp_path / options.pop("path"), **options)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_frame_is_shown_until_the_next_one(tmp_path):
-    table = TrackTable()
-    for frame in range(3):
-        table.append(frame, frame * 2.0, [track(id=1, distance_m=20.0)])
-    write_subtitles(table, tmp_path / "found.srt", fps=0.5)
-    assert read_cues(tmp_path / "found.srt") == {
-        "00:00:00,000 --> 00:00:06,000": ["1 vehicle, nearest #1: 20 m, -6 km/h relative"]
-    }

@@ -20,12 +20,6 @@ def test_labelled_frames_have_a_repr_and_iterate():
     assert set(one.labels["frame"].tolist()) == {1}
 
 
-def test_labels_may_name_the_images_without_their_suffix():
-    labels = TrackTable(["a", "c"], None, [[0, 0, 50, 40], [9, 0, 59, 40]])
-    images = dict(zip(("a.jpg", "b.jpg"), IMAGES))
-    assert LabelledFrames("road", images, labels).labels["frame"].tolist() == ["a.jpg"]
-
-
 def test_labelled_frames_of_a_video(tmp_path):
     drive = render_drive(frames=7, shape=(96, 160))
     path = write_clip(tmp_path / "drive.mp4", [scene.image for scene in drive])

@@ -175,16 +175,6 @@ def test_invalid_weights(tmp_path, runtime):
         find(load_network(file, runtime=runtime))
 
 
-def test_a_fixed_size(tmp_path):
-    file = tmp_path / "own.onnx"
-    file.write_bytes(own_network(size=(192, 320)))
-    model = load_network(file)
-    check_inside(find(model, score=-9.0), IMAGE.shape)
-    find(model, params=NetworkParams(input_size=320))
-    with pytest.raises(InvalidInputError, match=r"input_size must be omitted .* fixed size 320x192; got 640"):
-        find(model, params=NetworkParams(input_size=640))
-
-
 @pytest.mark.parametrize("dtype", ["uint8", "float32", "float16"])
 @pytest.mark.parametrize("layout", ["NCHW", "NHWC"])
 @pytest.mark.parametrize("runtime", RUNTIMES)

@@ -48,9 +48,3 @@ def test_trails_cover_the_last_seconds():
     axes = notebook.plot_birds_eye(results, CAMERA, fps=25, trail_seconds=1.0, ax=new_axes())
     trail = axes.lines[0].get_ydata()
     np.testing.assert_allclose(trail, 20.0 + np.arange(24, 50))
-
-
-def test_only_shown_tracks_with_a_distance_are_plotted():
-    hidden, unknown = track(shown=False), track(id=2, distance_m=None, distance_std_m=None)
-    axes = notebook.plot_birds_eye(result(0, hidden, unknown), ax=new_axes())
-    assert not axes.texts

@@ -84,17 +84,6 @@ def test_windows_and_boxes_equal_those_of_the_detector(scenes, model, method, mi
             np.testing.assert_array_equal(explorer.boxes().confidences, found.confidences)
 
 
-@pytest.mark.parametrize("model", ["default", "highway"])
-def test_a_camera_is_that_of_the_detector(scenes, model, tmp_path):
-    file = tmp_path / "camera.json"
-    file.write_text('{"fov": 90, "horizon": 0.56}')
-    for camera in (file, "wide-90"):
-        explorer = Explorer(scenes, model, camera=camera)
-        with VehicleDetector(model, camera=camera, jobs=1) as detector:
-            assert explorer.search_params == detector.detector.search_params
-            np.testing.assert_array_equal(explorer.boxes().boxes, detector.detect(scenes[0]).boxes)
-
-
 def test_the_given_parameters_are_used(scenes):
     camera = Camera.for_frame(SHAPE, horizon=0.56, height_m=2.0)
     params = SearchParams.preset("three-scales")

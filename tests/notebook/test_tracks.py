@@ -1,7 +1,6 @@
 from fractions import Fraction
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 
 from tests.notebook.helpers import legend, new_axes, texts
@@ -48,15 +47,6 @@ def test_tracks_are_plotted_over_time():
     np.testing.assert_allclose(figure.axes[2].lines[1].get_ydata(), [np.nan, 121, 122])
     band = figure.axes[2].collections[0].get_paths()[0].vertices[:, 1]
     assert (band.min(), band.max()) == (28, 34)  # one standard error
-
-
-def test_the_legend_of_many_tracks_fits_into_the_figure():
-    tracks = [track(number, 10.0 * number) for number in range(1, 91)]
-    figure = notebook.plot_tracks([result(0, *tracks), result(1, *tracks)])
-    FigureCanvasAgg(figure).draw()
-    extent = figure.legends[0].get_window_extent()
-    assert extent.y0 >= 0
-    assert extent.x1 <= figure.bbox.x1
 
 
 def test_frames_may_have_times_and_short_tracks_are_left_out():

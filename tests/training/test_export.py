@@ -8,8 +8,6 @@ from tests.training.networks import random_network  # noqa: E402
 from vehicle_detection.errors import ModelFileError  # noqa: E402
 from vehicle_detection.network import load_network, open_session  # noqa: E402
 from vehicle_detection.training import TrainingFrame, export_network, load_content, read_weights, set_metadata  # noqa: E402
-from vehicle_detection.training.architecture import Network  # noqa: E402
-from vehicle_detection.training.export import _CALIBRATION_SIZE  # noqa: E402
 
 PARAMS = {"input_size": 640, "slope": 1.5, "offset": -0.5, "threshold": 0.25, "nms_iou": 0.6}
 IMAGE = np.random.default_rng(0).integers(0, 256, (96, 160, 3), np.uint8)
@@ -72,14 +70,6 @@ def test_the_file_is_the_same_again(network, files):
     assert export_network(network, frames, PARAMS, {"note": "random"}) == files[True]
 
 
-def test_sides_of_the_input_are_free(files):
-    session = open_session(files[True], "test", jobs=1)
-    for height, width in (32, 32), (96, 224), _CALIBRATION_SIZE[::-1]:
-        (rows,) = session.run({"image": np.zeros((1, height, width, 3), np.uint8)})
-        assert rows.shape[1] == 5
-    session.close()
-
-
 # --- read_weights ---
 
 
@@ -93,13 +83,6 @@ def test_weights_of_a_quantized_file(network, files):
     rows, expected = run_torch(read_weights(files[True], "own.onnx")), run_torch(network)
     np.testing.assert_allclose(rows[4], expected[4], atol=0.02)
     assert np.median(np.abs(rows[:4] - expected[:4])) < 0.5
-
-
-def test_factors_of_1_may_be_absent_from_the_file():
-    torch.manual_seed(1)
-    network = Network().eval()
-    content = export_network(network, [], PARAMS, {}, quantize=False)
-    assert read_weights(content, "own.onnx").scale.tolist() == [1.0] * 4
 
 
 def change(content, edit):

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from tests.training.trial_cases import SMALL
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, extract_features
 from vehicle_detection.training import FeatureCache, feature_cache
 
@@ -64,9 +63,3 @@ def test_features_stay_on_disk(patch_set, tmp_path, monkeypatch, caplog):
         np.testing.assert_array_equal(found, expected)
         assert message in caplog.text
         assert file.read_bytes() == data
-
-
-def test_a_cache_folder_that_cannot_be_created(patch_set, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InvalidInputError, match=r"cache must be a folder, .*file cannot be created"):
-        FeatureCache(patch_set.patches, folder=tmp_path / "file")

@@ -3,13 +3,11 @@ import math
 import numpy as np
 import pytest
 
-from tests.training.trial_cases import SEARCH, SMALL
-from vehicle_detection.datasets import PatchSet
+from tests.training.trial_cases import SEARCH
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import FeatureParams
 from vehicle_detection.search import SearchBand, SearchParams
 from vehicle_detection.tables import TrackTable
-from vehicle_detection.training import TrainingOptions, mine_negatives, train_classifier
+from vehicle_detection.training import mine_negatives
 from vehicle_detection.windows import find_cars
 
 
@@ -64,18 +62,6 @@ def test_options_limit_the_number_of_windows(frames, labels, random_svm):
     assert count(min_score=1e5) == 0
     everything = TrackTable([0, 1], None, [[0, 0, 640, 360]] * 2, ignore=np.array([True, True]))
     assert len(mine_negatives(frames.frames, everything, random_svm, search_params=SEARCH)) == 0
-
-
-def test_training_with_mined_patches_removes_false_positives(patch_set, frames, labels):
-    params = FeatureParams(**SMALL)
-    few = patch_set[::3]
-    before = train_classifier(few.patches, few.labels, params=params, options=TrainingOptions(C=0.1))
-    mined = mine_negatives(frames.frames, labels, before, search_params=SEARCH, min_score=-0.5)
-    more = PatchSet.concatenate([few, mined])
-    after = train_classifier(more.patches, more.labels, params=params, options=TrainingOptions(C=0.1))
-    counts = [(each.decision_function(mined.patches) > -0.5).sum() for each in (before, after)]
-    assert counts[1] < counts[0] / 2
-    assert after.score(few.patches, few.labels) > 0.9
 
 
 def test_invalid_arguments(frames, labels, random_svm):

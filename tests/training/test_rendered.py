@@ -1,37 +1,15 @@
 import itertools
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from vehicle_detection.training import rendered_source
-from vehicle_detection.training.rendered import _LANE, _closest_truncation, _traffic
+from vehicle_detection.training.rendered import _LANE, _traffic
 
 
 @pytest.fixture(scope="module")
 def source():
     return rendered_source(frames=12)
-
-
-class TruthOnly(list):
-    """A drive of which only the ground truth is needed."""
-
-    truth_of = list.__getitem__
-
-
-def test_the_closest_frame_with_a_truncated_vehicle():
-    def moment(truncated, occluded=0):
-        return [SimpleNamespace(truncated=truncated, occluded=occluded)]
-
-    drive = TruthOnly([moment(0.0)] * 40)
-    assert _closest_truncation(drive, 17) == 17
-    drive[2], drive[32], drive[22], drive[27], drive[16] = (
-        moment(0.5), moment(0.3), moment(0.9), moment(0.5, 2), moment(0.5),
-    )  # fmt: skip
-    # Vehicles of which too little shows do not count, and only every fifth frame is searched.
-    assert _closest_truncation(drive, 17) in (2, 32)
-    drive[12] = moment(0.21)
-    assert _closest_truncation(drive, 17) == 12
 
 
 def test_rendered_frames_follow_from_the_seed(source):

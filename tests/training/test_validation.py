@@ -1,6 +1,3 @@
-import csv
-import math
-
 import numpy as np
 import pytest
 
@@ -17,7 +14,6 @@ from vehicle_detection.training import (
     fit_log_odds,
     format_fold,
     score_fold,
-    write_curves,
 )
 
 
@@ -62,16 +58,6 @@ def test_a_vehicle_in_an_ignored_group_is_not_false_in_the_region_scores():
     assert score.average_precision == score.region_average_precision == 0.5
 
 
-def test_fold_scores_without_detections_or_vehicles():
-    nothing = score_fold(fold_of([], []), 0.0)
-    assert (nothing.f1, nothing.best_f1, nothing.average_precision, nothing.recall) == (0, 0, 0, 0)
-    assert math.isnan(nothing.precision)
-    assert "precision" not in nothing.to_dict()
-    assert "calibration_error" not in nothing.to_dict()
-    empty = fold_of([0.3, 0.6], [False, False], frames=2, empty=2)
-    assert score_fold(empty, 0.5).false_per_empty_frame == 0.5
-
-
 def test_the_best_threshold_of_one_fold():
     fold = fold_of([1.0, 0.5, 0.0, -0.5], [True, True, True, False])
     assert -0.5 < best_threshold([fold]) <= 0.0
@@ -106,17 +92,6 @@ def test_log_odds_give_sources_with_more_vehicles_no_more_influence():
 def test_log_odds_of_too_few_boxes(hits):
     # All right, all wrong, or the better box wrong: nothing to fit.
     assert fit_log_odds([fold_of([0.9, 0.1][: len(hits)], hits)]) == (1.0, 0.0)
-
-
-def test_write_curves(tmp_path):
-    write_curves(tmp_path / "c.csv", [fold_of([1.0, 0.5], [True, False]), fold_of([], [])])
-    with (tmp_path / "c.csv").open(newline="") as file:
-        rows = list(csv.reader(file))
-    assert rows == [
-        ["frames", "logit", "precision", "recall"],
-        ["road", "1.0000", "1.0000", "0.2500"],
-        ["road", "0.5000", "0.5000", "0.2500"],
-    ]
 
 
 def test_recall_of_vehicles_that_are_hard_to_find():

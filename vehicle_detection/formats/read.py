@@ -327,7 +327,7 @@ def read_labels(
         - a KITTI ``label_2`` folder or one of its files, or a file of KITTI's tracking;
         - a MOTChallenge text file, or the MOT archive of CVAT;
         - a COCO JSON file, or a list of COCO results;
-        - a YOLO folder: ``labels/*.txt``, with class names in ``data.yaml`` or ``classes.txt``, or an unpacked
+        - a YOLO folder: ``labels/*.txt``, with names in ``data.yaml`` or ``classes.txt``, or an unpacked
           YOLO archive of CVAT.
     format
         ``"csv"``, ``"jsonl"``, ``"parquet"``, ``"kitti"``, ``"mot"``, ``"mot_zip"``, ``"coco"``,
