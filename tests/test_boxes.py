@@ -11,7 +11,6 @@ from vehicle_detection.boxes import (
     Detections,
     box_areas,
     clip_boxes,
-    greedy_nms,
     intersection_matrix,
     iou_matrix,
     iter_nms,
@@ -105,19 +104,15 @@ def test_nms_equals_its_definition(found, threshold):
     assert kept.tolist() == nms_by_definition(found.boxes, found.scores, threshold)
 
 
-@given(detections(), st.floats(0, 1), st.floats(0, 1))
-def test_nms_by_iou_and_coverage_equals_its_definition(found, max_iou, max_coverage):
-    kept = greedy_nms(found.boxes, found.scores, max_iou=max_iou, max_coverage=max_coverage)
-    assert kept.tolist() == nms_by_definition(found.boxes, found.scores, max_iou, max_coverage)
-
-
-@given(float_boxes, st.floats(0, 1), st.randoms(use_true_random=False))
-def test_iterative_nms_considers_the_listed_rows_and_yields_the_iou_with_all_boxes(boxes, max_iou, random):
+@given(float_boxes, st.floats(0, 1), st.floats(0, 1), st.randoms(use_true_random=False))
+def test_iterative_nms_considers_the_listed_rows_and_yields_the_iou_with_all_boxes(
+    boxes, max_iou, max_coverage, random
+):
     order = [row for row in range(len(boxes)) if random.random() < 0.7]
     random.shuffle(order)
-    kept = list(iter_nms(boxes, np.array(order, np.intp), max_iou=max_iou))
+    kept = list(iter_nms(boxes, np.array(order, np.intp), max_iou=max_iou, max_coverage=max_coverage))
     scores = -np.arange(len(order))
-    expected = [order[index] for index in nms_by_definition(boxes[order], scores, max_iou)]
+    expected = [order[index] for index in nms_by_definition(boxes[order], scores, max_iou, max_coverage)]
     assert [row for row, _ in kept] == expected
     for row, iou in kept:
         np.testing.assert_array_equal(iou, iou_matrix(boxes[[row]], boxes)[0])

@@ -399,8 +399,9 @@ def _table() -> Any:
 _OTHER_NAMES = {
     "clf": "classifier", "cost": "column", "X_scaler": "scaler", "svc": "classifier", "by": "column",
     "frames": "frame", "label": "column", "n_frames": "frames", "parameter": "column", "path": "file|folder",
-    "quality": "column", "configurations": "configuration|preset", "image": "path",
-    "patches": "image file", "windows": "boxes", "X": "source",
+    "quality": "column", "configurations": "configuration|preset", "image": "path", "frame": "img|image",
+    "patches": "image file", "windows": "boxes", "X": "source", "name": "preset", "detector": "model",
+    "vehicles": "png", "non_vehicles": "png",
 }  # fmt: skip
 """What the error of a bad argument may name instead."""
 
@@ -411,7 +412,10 @@ def _names(argument: str, text: str, error: BaseException) -> bool:
     return bool(re.search(rf"\b({names})\b", str(error))) or text.startswith(_ALSO_OTHER_ERRORS)
 
 
-_ALSO_OTHER_ERRORS = ("TrackTable.append(", "course.bin_spatial(size", "course.draw_labeled_bboxes(img")
+_ALSO_OTHER_ERRORS = (
+    "TrackTable.append(", "course.bin_spatial(size", "course.draw_labeled_bboxes(img",
+    "notebook.plot_tracks(min_frames",
+)  # fmt: skip
 """Calls whose error may be that of another argument, which the bad one contradicts."""
 
 _KEEPS_FILES = "tune --cache "

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from itertools import islice
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -344,18 +343,10 @@ def iter_nms(
         yield int(best), iou
 
 
-def greedy_nms(
-    boxes: Floats,
-    scores: Floats,
-    *,
-    max_iou: float,
-    max_coverage: float = np.inf,
-    max_boxes: int | None = None,
-) -> NDArray[np.intp]:
-    """Rows that `iter_nms` keeps, best score first, at most `max_boxes`; equal scores keep their order."""
+def greedy_nms(boxes: Floats, scores: Floats, *, max_iou: float) -> NDArray[np.intp]:
+    """Rows that `iter_nms` keeps, best score first; equal scores keep their order."""
     order = np.argsort(-scores, kind="stable")
-    kept = iter_nms(boxes, order, max_iou=max_iou, max_coverage=max_coverage)
-    return np.array([row for row, _ in islice(kept, max_boxes)], np.intp)
+    return np.array([row for row, _ in iter_nms(boxes, order, max_iou=max_iou)], np.intp)
 
 
 def non_max_suppression(

@@ -96,16 +96,6 @@ def evaluate_distances(
     iou, frames
         As in `evaluate_detections`.
 
-    Returns
-    -------
-    DistanceScores
-        Errors of the distances by range, of the speeds and of the times to collision.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed.
-
     Examples
     --------
     >>> boxes = [[10, 10, 60, 50], [100, 20, 140, 60]]

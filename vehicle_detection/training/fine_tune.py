@@ -208,12 +208,12 @@ def file_params(model: NetworkModel) -> dict[str, float]:
     return {name: getattr(model, name) for name in ("input_size", "slope", "offset", "threshold", "nms_iou")}
 
 
-def load_content(content: bytes, name: str = "the trained network") -> NetworkModel:
+def load_content(content: bytes) -> NetworkModel:
     """Load a network from the content of its file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "network.onnx"
         path.write_bytes(content)
-        return dataclasses.replace(load_network(path), name=name)
+        return dataclasses.replace(load_network(path), name="the trained network")
 
 
 def detect_logits(

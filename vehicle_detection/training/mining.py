@@ -63,6 +63,7 @@ def mine_negatives(
     >>> len(mine_negatives([road], TrackTable(frame_keys=[0]), load_classifier()))
     0
     """
+    check_type(source, "source", str, "pass a name for the patches' source folder")
     labelled = LabelledFrames(source, keyed_frames(frames), labels)
     overlap = check_number(max_overlap, "max_overlap", low=0, high=1)
     limit = None if max_per_frame is None else check_integer(max_per_frame, "max_per_frame", low=1)
