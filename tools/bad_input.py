@@ -250,7 +250,7 @@ class _Valid:
                   "spatial_size": (16, 16), "hist_bins": 16, "windows": [((0, 0), (64, 64))], "ystart": 0,
                   "ystop": 96, "scale": 1.0}  # fmt: skip
         self.instances: dict[str, Any] = {
-            "Annotator": vd.Annotator(), "Camera": camera, "Detections": windows,
+            "Annotator": vd.Annotator(), "Box": vd.course.Box(), "Camera": camera, "Detections": windows,
             "Detector": detector.detector, "Explorer": vd.Explorer([image], classifier),
             "TrackTable": predicted, "FunctionParams": vd.FunctionParams(), "HeatHistory": vd.HeatHistory(),
             "FrameSource": vd.open_source(clip), "HeatmapDetector": vd.HeatmapDetector(classifier),
@@ -326,6 +326,8 @@ class _Valid:
             "compare_configurations": {"configurations": {"a": params}, "options": quick},
             "detector_from": {"function": lambda image: (boxes, scores)},
             "draw_labeled_bboxes": {"labels": (heat.astype(np.int32), 0)},
+            "course.Box.add": {"box": ((0, 0), (9, 9))},
+            "course.adjust_bbox": {"bbox": ((0, 0), (9, 9)), "previous": ((1, 0), (10, 9))},
             "course.find_car_windows": lesson_only,
             "course.find_cars": lesson_only,
             "course.search_windows": {**lesson_only, "color_space": "RGB", "orient": 4},
@@ -364,6 +366,7 @@ class _Valid:
                 "model": "highway",
                 "progress": False,
                 "tracks_only": True,
+                "dry_run": True,
             },
             "search_parameters": {"grid": {"orient": [4]}, "halving": Halving(n_folds=2), "options": quick},
             "search_windows": {"windows": boxes, "jobs": 1},
@@ -399,8 +402,10 @@ def _table() -> Any:
 _OTHER_NAMES = {
     "clf": "classifier", "cost": "column", "X_scaler": "scaler", "svc": "classifier", "by": "column",
     "frames": "frame", "label": "column", "n_frames": "frames", "parameter": "column", "path": "file|folder",
-    "quality": "column", "configurations": "configuration|preset", "image": "path", "frame": "img|image",
-    "patches": "image file", "windows": "boxes", "X": "source", "name": "preset", "detector": "model",
+    "quality": "column", "configurations": "configuration|preset", "image": "path|frame",
+    "frame": "img|image", "patches": "image file", "windows": "boxes|bbox_list", "X": "source",
+    "name": "preset", "detector": "model", "imgs": "image file", "hist_feat": "features", "hog_feat": "features",
+    "spatial_feat": "features",
     "vehicles": "png", "non_vehicles": "png",
 }  # fmt: skip
 """What the error of a bad argument may name instead."""
