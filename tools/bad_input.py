@@ -404,8 +404,8 @@ _OTHER_NAMES = {
     "frames": "frame", "label": "column", "n_frames": "frames", "parameter": "column", "path": "file|folder",
     "quality": "column", "configurations": "configuration|preset", "image": "path|frame",
     "frame": "img|image", "patches": "image file", "windows": "boxes|bbox_list", "X": "source",
-    "name": "preset", "detector": "model", "imgs": "image file", "hist_feat": "features", "hog_feat": "features",
-    "spatial_feat": "features",
+    "name": "preset", "detector": "model", "imgs": "image file", "hist_feat": "features",
+    "hog_feat": "features", "spatial_feat": "features",
     "vehicles": "png", "non_vehicles": "png",
 }  # fmt: skip
 """What the error of a bad argument may name instead."""
