@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import pytest
+
 import vehicle_detection
 from vehicle_detection._kernels.features import value_counts
 from vehicle_detection._kernels.jit import _Compilation, _save
@@ -32,6 +34,35 @@ def test_a_kernel_that_cannot_be_kept_is_used(caplog):
         _save(save, None, None)
     assert "compiled kernels are not kept: [Errno 28] No space left on device" in caplog.text
     assert value_counts._cache.save_overload.func is _save
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs the permissions of POSIX")
+@pytest.mark.parametrize("mode", [0o700, 0o777])
+def test_a_read_only_installation_keeps_kernels_in_a_temporary_folder(tmp_path, mode):
+    """Another user could put code into a folder that all may write."""
+    package, temporary = tmp_path / "vehicle_detection", tmp_path / "tmp"
+    ignored = shutil.ignore_patterns("__pycache__", "*.safetensors", "*.onnx")
+    shutil.copytree(Path(vehicle_detection.__file__).parent, package, ignore=ignored)
+    (package / "_kernels" / "__pycache__").write_text("no folder")
+    temporary.mkdir()
+    (temporary / f"vehicle-detection-kernels-{os.getuid()}").mkdir()
+    (temporary / f"vehicle-detection-kernels-{os.getuid()}").chmod(mode)
+    code = (
+        "import numpy as np; from vehicle_detection._kernels.features import value_counts;"
+        "value_counts(np.zeros((4, 4, 3), np.uint8), np.zeros((3, 256), int));"
+        "print(sum(value_counts.stats.cache_hits.values()) if value_counts._cache.cache_path else 0)"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    environment |= {"PYTHONPATH": str(tmp_path), "HOME": "/dev/null/home", "TMPDIR": str(temporary)}
+    environment |= {"XDG_CACHE_HOME": "/dev/null/cache", "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-c", code]
+    options = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
+    runs = [subprocess.run(command, check=mode == 0o700, **options) for _ in range(2)]
+    if mode == 0o700:
+        assert [run.stdout.strip() for run in runs] == ["0", "1"]
+    expected = f"kernels are kept in {temporary}" if mode == 0o700 else "each process compiles them"
+    assert [expected in run.stderr for run in runs] == [True, True]
+    assert runs[0].stderr.count("kernels are") == (mode == 0o700)
 
 
 def test_a_change_of_another_kernel_file_is_noticed(tmp_path):

@@ -1,5 +1,6 @@
 """Speed of the own vehicle: GPX tracks, tables, and their refusal."""
 
+import functools
 import math
 import os
 import string
@@ -96,6 +97,43 @@ class TestGpx:
         points = [(50, 10, time, f"<speed>{speed}</speed>") for time, speed in known]
         assert read_own_speed(write_gpx(tmp_path / "a.gpx", points)).at([0, 2]).tolist() == [1, 3]
 
+    @pytest.mark.parametrize(
+        ("factor", "word"),
+        [(1.0, ""), (3.6, "km/h"), (2.237, "mph"), (1.944, "knots"), (0.0, "0 at 20 points")],
+    )
+    def test_speeds_in_other_units_and_zeros_agree_with_the_positions(self, tmp_path, caplog, factor, word):
+        speeds = 15 + np.arange(20) % 3
+        way = np.cumsum(speeds) / DEGREE_M
+        points = [
+            (50 + place, 10, time_of(second), f"<speed>{speed * factor}</speed>")
+            for second, (place, speed) in enumerate(zip(way, speeds, strict=True))
+        ]
+        found = read_own_speed(write_gpx(tmp_path / "a.gpx", points))
+        np.testing.assert_allclose(found.at(np.arange(20)), speeds, rtol=1e-3 if factor else 0.1)
+        assert word in caplog.text
+        assert len(caplog.records) == (factor != 1)
+
+    def test_speeds_that_contradict_the_positions_are_refused(self, tmp_path):
+        points = [(50 + 15 * n / DEGREE_M, 10, time_of(n), f"<speed>{7 + n % 5}</speed>") for n in range(20)]
+        with pytest.raises(InvalidInputError, match=r"0 s after the first point, the speed is 7.0 m/s, but"):
+            read_own_speed(write_gpx(tmp_path / "a.gpx", points))
+
+    def test_single_zeros_and_a_standing_receiver_are_believed(self, tmp_path, caplog):
+        points = [(50, 10, time_of(n), f"<speed>{20 * (n % 2)}</speed>") for n in range(20)]
+        assert read_own_speed(write_gpx(tmp_path / "a.gpx", points)).at([4, 5]).tolist() == [0, 20]
+        assert not caplog.records
+
+    def test_points_with_a_date_of_years_before_are_left_out(self, tmp_path, caplog):
+        points = [(50, 10, time_of(n), f"<speed>{10 + n}</speed>") for n in range(9)]
+        points[:2] = [(0, 0, "1980-01-06T00:00:00Z", "<speed>0</speed>")] * 2
+        assert read_own_speed(write_gpx(tmp_path / "a.gpx", points)).at([0, 1]).tolist() == [12, 13]
+        assert "left out 1 point years from the others, such as of 1980-01-06" in caplog.text
+
+    def test_a_speed_of_a_plane_is_told(self, tmp_path, caplog):
+        points = [(50, 10, time_of(n), "<speed>100</speed>") for n in range(9)]
+        assert read_own_speed(write_gpx(tmp_path / "a.gpx", points)).at([3]) == 100
+        assert "360 km/h 0 s after the first point; check its unit" in caplog.text
+
     def test_declarations_are_refused(self, tmp_path):
         """An entity of ten nested levels would expand to gigabytes."""
         entities = '<!ENTITY a0 "ha">' + "".join(
@@ -128,7 +166,37 @@ class TestGpx:
             read_own_speed(path)
 
 
+def sentence(second, knots, status="A", south="N"):
+    text = (
+        f"GNRMC,08150{second}.500,{status},5000.{second * 10:04},{south},01000.0000,W,{knots},84.4,310126,,,A"
+    )
+    check = functools.reduce(lambda bits, letter: bits ^ ord(letter), text, 0)
+    return f"[1769847300123]${text}*{check:02X}\r\n$GPGSV,3,1,11*4A\r\n"
+
+
+class TestNmea:
+    def test_speeds_of_valid_sentences(self, tmp_path):
+        path = tmp_path / "a.NMEA"
+        text = "".join(sentence(second, 36.0 / 1.852 * 1.0) for second in range(5))
+        path.write_text(text + sentence(7, 99, "V") + sentence(8, 99).replace("310126", "310127"))
+        found = read_own_speed(path)
+        np.testing.assert_allclose(found.at([0, 2.5, 4]), 10, rtol=1e-6)
+        assert np.isnan(found.at([4.1]))
+
+    def test_other_files_are_refused(self, tmp_path):
+        (tmp_path / "a.nmea").write_bytes(b"\xff no sentences")
+        with pytest.raises(InvalidInputError, match="at least two track points with times, got 0"):
+            read_own_speed(tmp_path / "a.nmea")
+
+
 class TestTable:
+    def test_a_wrong_unit_beside_positions(self, tmp_path, caplog):
+        path = tmp_path / "speed.csv"
+        rows = [f"{n},{50 + 10 * n / DEGREE_M},10,36\n" for n in range(9)]
+        path.write_text("time_s,latitude,longitude,speed_mps\n" + "".join(rows) + "9,,,36\n")
+        np.testing.assert_allclose(read_own_speed(path).at([0, 4, 9]), 10, rtol=1e-6)
+        assert "3.60 times those of the positions, so they are read as km/h" in caplog.text
+
     @pytest.mark.parametrize(("unit", "factor"), [("mps", 1), ("kmh", 1 / 3.6), ("mph", 1609.344 / 3600)])
     def test_units(self, tmp_path, unit, factor):
         path = tmp_path / "speed.csv"
@@ -155,8 +223,14 @@ class TestTable:
             read_own_speed(path)
 
 
+def test_the_record_follows_the_clock_of_the_camera():
+    """The camera paused for 2 s after 60 s of video."""
+    own = OwnSpeed(np.arange(200.0), np.arange(200.0), clock=((0.0, 0.0), (60.0, 62.0)))
+    assert own.at([-1, 0, 59.5, 60, 100]).tolist() == pytest.approx([np.nan, 0, 59.5, 62, 102], nan_ok=True)
+
+
 def test_other_paths_are_refused(tmp_path, monkeypatch):
-    with pytest.raises(InvalidInputError, match=r"path must end in .gpx or .csv, got 'a.kml'"):
+    with pytest.raises(InvalidInputError, match=r"path must end in .gpx or .nmea or .csv, got 'a.kml'"):
         read_own_speed(tmp_path / "a.kml")
     with pytest.raises(InvalidInputError, match=r"a.gpx does not exist; check the path"):
         read_own_speed(tmp_path / "a.gpx")

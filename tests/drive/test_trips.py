@@ -2,7 +2,7 @@
 
 import itertools
 import os
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -13,8 +13,10 @@ from vehicle_detection.drive import find_trips
 from vehicle_detection.video import is_video_file
 
 
-def summary(names, **options):
-    return [(trip.camera, [str(file) for file in trip.files]) for trip in find_trips(names, **options)]
+def summary(names, seconds=60.0):
+    """Cameras and files of the trips, if each file is that long."""
+    found = find_trips(names, duration=lambda _: seconds)
+    return [(trip.camera, [str(file) for file in trip.files]) for trip in found]
 
 
 @pytest.mark.parametrize(
@@ -71,20 +73,31 @@ def test_folders_are_different_trips_and_clocks_may_drift_by_a_second():
     assert summary(names) == [("front", names)]
 
 
-def test_a_short_segment_is_probed():
+@pytest.mark.parametrize(
+    ("seconds", "starts", "trips"),
+    [
+        (59.9, (0, 60), [2]),
+        (30.0, (0, 60), [1, 1]),
+        (63.0, (0, 60), [2]),
+        (64.0, (0, 60), [1, 1]),
+        (2.0, (0, 120, 240, 360), [1, 1, 1, 1]),  # equal gaps
+        (60.0, (0, 30, 60), [1, 1, 1]),  # overlaps
+        (0.0, (0, 60, 120), [1, 1, 1]),  # of unknown length
+    ],
+)
+def test_a_segment_begins_where_the_one_before_it_ends(seconds, starts, trips):
+    names = [f"20260131_08{15 + start // 60}{start % 60:02}_F.mp4" for start in starts]
+    found = find_trips(names, duration=lambda name: seconds)
+    assert [len(trip.files) for trip in found] == trips
+    gaps = [after - before - seconds if seconds else None for before, after in itertools.pairwise(starts)]
+    assert [trip.gap_s for trip in found] == [None, *gaps][: len(trips)]
+
+
+def test_a_short_segment_ends_a_trip():
     names = [f"20260131_08{time}_F.mp4" for time in ("1500", "1600", "1700", "1720", "1900", "2000")]
-    seconds = {names[2]: 20.0}
-    joined = [names[:4], names[4:]]
-    assert [files for _, files in summary(names, duration=seconds.__getitem__)] == joined
-    seconds = {names[2]: 11.0}
-    assert len(find_trips(names, duration=seconds.__getitem__)) == 3
-    assert len(find_trips(names)) == 3
-
-
-@pytest.mark.parametrize(("seconds", "trips"), [(59.9, 1), (30.0, 2), (63.0, 1), (64.0, 2)])
-def test_two_segments_are_probed(seconds, trips):
-    names = ["20260131_081500_F.mp4", "20260131_081600_F.mp4"]
-    assert len(find_trips(names, duration=lambda name: seconds)) == trips
+    for length, trips in ((20.0, [4, 2]), (11.0, [3, 1, 2])):
+        found = find_trips(names, duration=lambda name, length=length: length if "1700" in name else 60.0)
+        assert [len(trip.files) for trip in found] == trips
 
 
 def test_numbers_without_times():
@@ -96,27 +109,88 @@ def test_numbers_without_times():
         ("unknown", ["GX010007.MP4", "GX020007.MP4"]),
         ("unknown", ["GX010008.MP4"]),
     ]
+    assert summary(["GOPR0007.MP4", "GP010007.MP4", "GP020007.MP4", "GL010007.MP4"]) == [
+        ("unknown", ["GOPR0007.MP4", "GP010007.MP4", "GP020007.MP4"]),
+        ("unknown", ["GL010007.MP4"]),
+    ]
     assert len(find_trips(["drive.mp4", "walk.mp4"])) == 2
     assert len(find_trips(["drive1.mp4", "drive2.mp4", "drive3.mp4"])) == 3
 
 
 @pytest.mark.parametrize(
-    ("ends", "trips"),
+    ("ends", "trips", "warned"),
     [
-        ((0, 0.5, 1, 1.5, 2), [5]),  # copied without their times
-        ((0, 60, 120, 180, 200), [5]),  # the last one is short
-        ((0, 60, 120, 180, 3600), [4, 1]),
-        ((0, 60, 120, 170, 230), [3, 2]),  # 20 s long, 30 s later
+        ((0, 0.5, 1, 1.5, 2), [5], True),  # copied without their times
+        ((0, 9, 18, 26, 29), [5], True),  # copied slowly: two files are never recorded at once
+        ((0, 60, 120, 180, 200), [5], False),  # the last one is short
+        ((0, 60, 120, 180, 3600), [4, 1], False),
+        ((0, 60, 120, 190, 250), [3, 1, 1], False),  # equal steps of 60 s, to a file of 20 s
+        ((0, 600, 1200, 1800, 2400), [1, 1, 1, 1, 1], False),  # equal gaps
     ],
 )
-def test_numbers_with_modification_times(tmp_path, ends, trips):
+def test_numbers_with_modification_times(tmp_path, caplog, ends, trips, warned):
     files = [tmp_path / f"GRMN{number:04}.MP4" for number in range(5)]
     for file, end in zip(files, ends, strict=True):
         file.touch()
         os.utime(file, (1.77e9 + end, 1.77e9 + end))
-    seconds = {files[3]: 20.0, files[4]: 20.0}
-    found = find_trips(files, duration=seconds.__getitem__)
+    found = find_trips(files, duration=lambda file: 20.0 if file == files[4] else 60.0)
     assert [len(trip.files) for trip in found] == trips
+    assert ("cp -p" in caplog.text) == warned
+
+
+# File names of a maker for the seconds of a day, and the camera.
+MAKERS = {
+    "{0:%Y%m%d_%H%M%S}_NF.mp4": "front",  # BlackVue
+    "{0:%Y%m%d_%H%M%S}_EI.mp4": "interior",
+    "{0:%Y%m%d_%H%M%S}_NR.mp4": "rear",
+    "{0:%Y%m%d_%H%M%S}_NFS.mp4": "front",
+    "GH{1:02}0042.MP4": "unknown",  # GoPro
+    "{0:%Y_%m%d_%H%M%S}_{1:06}F.MP4": "front",  # Viofo
+    "{0:%Y_%m%d_%H%M%S}_{1:06}PI.MP4": "interior",
+    "NO{0:%Y%m%d-%H%M%S}-{1:06}B.MP4": "rear",  # 70mai
+    "{0:%y%m%d_%H%M%S}_{1:03}_FH.MP4": "front",  # Nextbase
+    "{0:%y%m%d_%H%M%S}_{1:03}_CL_RADR.MP4": "interior",
+    "GRMN{1:04}.MP4": "unknown",  # Garmin
+    "REC_{0:%Y_%m_%d_%H_%M_%S}_R.MP4": "rear",  # Thinkware
+    "{0:%Y%m%d_%H%M%S}_{1:05}_N_A.MP4": "front",  # Vantrue
+    "{0:%Y%m%d_%H%M%S}_{1:05}_N_C.MP4": "rear",
+    "{0:%Y-%m-%d_%H-%M-%S}-left_pillar.mp4": "left",  # Tesla
+}
+
+
+@pytest.mark.parametrize(
+    ("starts", "trips"),
+    [
+        ((0, 60, 120, 180), [4]),
+        ((0, 61, 121, 183), [4]),  # the clock's seconds, and a short pause between two files
+        ((0, 60, 600, 660), [2, 2]),
+        ((0, 600, 1200, 1800), [1, 1, 1, 1]),
+        ((0, 60, 120, "broken"), [4]),  # the camera lost power: the last one has no length
+    ],
+)
+@pytest.mark.parametrize("form", MAKERS)
+def test_trips_of_the_common_makers(tmp_path, form, starts, trips):
+    lengths = {}
+    for number, start in enumerate(starts, 1):
+        begin = datetime(2026, 1, 31, 8) + timedelta(seconds=180 if start == "broken" else start)
+        file = tmp_path / form.format(begin, number)
+        file.touch()
+        lengths[file] = 0.0 if start == "broken" else 60.0
+        end = begin.timestamp() + (lengths[file] or 20)
+        os.utime(file, (end, end))
+    found = find_trips(reversed(lengths), duration=lengths.__getitem__)
+    if form.startswith("GH"):  # the chapters of a recording have no gaps
+        trips = [4]
+    assert [len(trip.files) for trip in found] == trips
+    assert {trip.camera for trip in found} == {MAKERS[form]}
+    assert [file for trip in found for file in trip.files] == list(lengths)
+
+
+def test_cameras_kinds_of_recording_and_copies_in_low_resolution_are_told_apart():
+    time, names = "20260131_081500", "NF NR NI NFS EF"
+    assert len(find_trips([f"{time}_{name}.mp4" for name in names.split()])) == 5
+    names = [f"{time}_NF.mp4", "20260131_081600_EF.mp4", "20260131_081700_NFL.mp4"]  # one camera, in order
+    assert summary(names) == [("front", names)]
 
 
 def test_paths_and_urls_keep_their_type():
@@ -147,7 +221,7 @@ def test_the_query_of_a_url_tells_no_time():
 )
 def test_vehicles_and_channels_are_trips_of_their_own(names):
     times = [f"20260131_0815{second:02}" for second in (0, 5, 10, 15)]
-    found = summary([f"{name.format(time)}.mp4" for name in names for time in times])
+    found = summary([f"{name.format(time)}.mp4" for name in names for time in times], 5.0)
     assert [files for _, files in found] == [[f"{name.format(time)}.mp4" for time in times] for name in names]
 
 
@@ -167,7 +241,7 @@ def test_vehicles_and_channels_are_trips_of_their_own(names):
 )
 def test_counters_of_files_are_no_names(form, camera):
     names = [form.format(second, 7 + number) for number, second in enumerate((0, 5, 10, 15))]
-    assert summary(names) == [(camera, names)]
+    assert summary(names, 5.0) == [(camera, names)]
     assert find_trips(names)[0].start == datetime(2026, 1, 31, 8, 15)
 
 

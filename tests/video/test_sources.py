@@ -29,7 +29,16 @@ from tests.video.clips import (
 )
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.images import write_image
-from vehicle_detection.video import live, open_source, probe_video, process_video, read_frames, remote
+from vehicle_detection.video import ffmpeg as ffmpeg_module
+from vehicle_detection.video import (
+    live,
+    open_source,
+    probe_video,
+    process_video,
+    read_frames,
+    reading,
+    remote,
+)
 
 
 def numbers(source, **options):
@@ -138,14 +147,6 @@ def test_a_folder_or_pattern_with_several_videos_is_refused(card, source):
         open_source(str(card / source))
 
 
-def test_a_damaged_segment_is_named(card, tmp_path):
-    files = sorted(card.glob("2*F.mp4"))
-    cut = tmp_path / "cut.mp4"
-    cut.write_bytes(files[1].read_bytes()[:1000])
-    with pytest.raises(VideoError, match=r"cut\.mp4 is not a video"):
-        open_source([files[0], cut])
-
-
 def test_missing_frames_of_a_segment_are_reported(card, tmp_path):
     files = sorted(card.glob("2*F.mp4"))
     lost = damage_sizes(files[1], tmp_path / "lost.mp4", entry=3, byte=0, flip=64)
@@ -194,6 +195,143 @@ def test_bad_sources(tmp_path, monkeypatch, source, message):
         open_source(source)
     with pytest.raises(InvalidInputError, match="fps must be a number"):
         open_source("x.mp4", fps=0)
+
+
+RAW = [
+    ("mjpeg", ("-c:v", "mjpeg", "-pix_fmt", "yuvj420p", "-f", "mjpeg"), None),
+    ("h264", ("-f", "h264"), 12),
+    ("m2v", ("-c:v", "mpeg2video", "-q:v", "2", "-r", "24", "-f", "mpeg2video"), 24),
+    ("y4m", ("-c:v", "rawvideo", "-f", "yuv4mpegpipe"), "container"),
+    ("ts", ("-f", "mpegts"), "container"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("suffix", "options", "rate"), RAW)
+@pytest.mark.parametrize("fps", [None, 10, 12])
+def test_the_rate_of_raw_streams_is_honoured_and_that_of_others_is_refused(
+    tmp_path, caplog, suffix, options, rate, fps
+):
+    path = write_clip(tmp_path / f"raw.{suffix}", gray_frames(12), fps=12, options=options)
+    frames = 24 if suffix == "m2v" else 12
+    if rate == "container" and fps:
+        with pytest.raises(InvalidInputError, match=r"fps must be omitted for .*\(12 frames/s\)"):
+            open_source(path, fps=fps)
+        return
+    index, times, _ = numbers(path, **({} if fps is None else {"fps": fps}))
+    used = fps or {None: 25, "container": 12}.get(rate, rate)
+    assert index == tuple(range(frames))
+    assert times == pytest.approx(np.arange(frames) / used)
+    warned = "no frame rate" if fps is rate is None else "states" if fps and rate not in (None, fps) else ""
+    assert warned in caplog.text
+    assert bool(caplog.records) == bool(warned)
+    with open_source(path, fps=fps) as source, source.read(5) as part:  # a jump, without times in the file
+        levels = [round((frame[8:-8, 8:-8].mean() - 10) / 10) for _, _, frame in part]
+    assert levels == [n * 12 // frames for n in range(5, frames)]
+
+
+def test_the_rate_of_images_is_told_if_it_is_assumed(tmp_path, caplog):
+    for number, frame in enumerate(gray_frames(2)):
+        write_image(tmp_path / f"{number}.png", frame)
+    for options, warned in (({"fps": 25}, False), ({}, True)):
+        open_source(tmp_path, **options).close()
+        assert ("no frame rate: 25 is assumed" in caplog.text) == warned
+    with pytest.raises(InvalidInputError, match="stream must be omitted for images"):
+        open_source(tmp_path, stream=1)
+
+
+def test_the_rate_of_a_pipe(tmp_path):
+    path = write_clip(tmp_path / "raw.mjpeg", gray_frames(12), fps=12, options=RAW[0][1])
+    code = (
+        "import sys, logging; from vehicle_detection.video import open_source;"
+        "fps = float(sys.argv[1]) or None;"
+        "print(*(f'{time:.2f}' for _, time, _ in open_source('-', fps=fps)))"
+    )
+    for fps, last, warned in ((0, 11 / 25, True), (12, 11 / 12, False)):
+        command = [sys.executable, "-c", code, str(fps)]
+        with path.open("rb") as file:
+            done = subprocess.run(command, stdin=file, capture_output=True, text=True, check=True)
+        times = done.stdout.split()
+        assert (len(times), float(times[-1])) == (12, pytest.approx(last, abs=0.01))
+        assert ("no frame rate: 25 is assumed" in done.stderr) == warned
+
+
+@pytest.mark.parametrize(
+    ("marked", "frames", "chosen"),
+    [
+        ((0, 1), (8, 8), 1),  # the default one
+        ((1, 0), (8, 8), 0),
+        ((0, 0), (8, 8), 1),  # the largest one
+        ((1, 1), (8, 8), 1),
+        ((0, 0), (8, 1), 0),  # a picture is no video
+        ((1, 0), (1, 8), 1),
+    ],
+)
+def test_the_default_or_largest_of_several_video_streams(tmp_path, caplog, marked, frames, chosen):
+    sizes = ((64, 48), (96, 64))
+    parts = [
+        write_clip(tmp_path / f"{n}.mkv", gray_frames(count, *size), fps=8)
+        for n, (count, size) in enumerate(zip(frames, sizes))
+    ]
+    words = ["default" if mark else 0 for mark in marked]
+    both, copied = tmp_path / "both.mkv", ("-map", 0, "-map", 1, "-c", "copy")
+    marks = ("-disposition:v:0", words[0], "-disposition:v:1", words[1])
+    ffmpeg("-i", parts[0], "-i", parts[1], *copied, *marks, both)
+    for stream in (None, 0, 1):
+        expected = chosen if stream is None else stream
+        with open_source(both, stream=stream) as source:
+            shapes = [frame.shape[1::-1] for _, _, frame in source]
+            assert source.info.stream == expected
+        assert set(shapes) == {sizes[expected]}
+        assert len(shapes) in (8, frames[expected])
+        other = f"not {1 - chosen} ({sizes[1 - chosen][0]}x"
+        assert (other in caplog.text) == (stream is None)
+        caplog.clear()
+    with pytest.raises(VideoError, match=r"has the video streams [01, ]+ not 2; choose one"):
+        open_source(both, stream=2)
+
+
+@pytest.mark.parametrize("fault", ["empty", "no index", "no frame"])
+def test_a_last_segment_that_cannot_be_read_costs_itself_only(tmp_path, caplog, fault):
+    files = [tmp_path / f"20260131_08150{second}_F.mp4" for second in range(3)]
+    for file in files:
+        write_clip(file, gray_frames(8), fps=8, options=("-movflags", "+faststart") * (fault == "no frame"))
+    data = files[2].read_bytes()
+    kept = {"empty": 0, "no index": len(data) // 2, "no frame": data.find(b"mdat") + 30}[fault]
+    files[2].write_bytes(data[:kept])
+    report = process_video(files, tmp_path / "trip.mp4", StubDetector())
+    assert frame_numbers(tmp_path / "trip.mp4") == [*range(8), *range(8)]
+    assert f"the last segment is left out: {files[2]} " in report.damage
+    assert "frame=" not in report.damage
+    assert caplog.text.count("is left out") == 1
+    with pytest.raises(VideoError, match=files[2].name):
+        open_source(files, strict=True)
+    with pytest.raises(VideoError, match=files[2].name):
+        open_source([files[0], files[2], files[1]])
+    with open_source(files) as source, source.read(0, 8) as reader:  # it was not asked for
+        assert (len(list(reader)), reader.damage) == (8, "")
+
+
+@pytest.mark.parametrize("change", ["truncated", "replaced"])
+def test_a_source_that_changes_while_it_is_read_is_named(tmp_path, change):
+    path = write_clip(tmp_path / "drive.mp4", gray_frames(20), sound=True)
+    with open_source(path) as source:
+        assert source.find_change() == ""
+        with path.open("ab") as file:  # still recording
+            file.write(b"more")
+        assert source.find_change() == ""
+
+        def spoil(result):
+            if change == "truncated":
+                os.truncate(path, 3000)
+            else:
+                shutil.copy(path, tmp_path / "copy.mp4")
+                (tmp_path / "copy.mp4").replace(path)
+
+        try:
+            said = process_video(source, tmp_path / "out.mp4", StubDetector(), on_result=spoil).damage
+        except VideoError as error:
+            said = str(error)
+        assert f"{path} was replaced or truncated while it was read" in said
 
 
 def test_a_file_on_other_storage_is_copied(clip, tmp_path, monkeypatch):
@@ -373,6 +511,35 @@ def test_a_file_on_a_web_server(folder):
         with pytest.raises(VideoError, match="404"):
             open_source(f"{address}/other.mp4")
     assert index == seen == tuple(range(20))
+
+
+def test_a_server_that_sends_too_little_fails_at_a_deadline(folder, tmp_path, monkeypatch):
+    """Each byte comes in time, but not enough of them."""
+    path = write_clip(folder / "slow.mp4", gray_frames(20), options=("-movflags", "+faststart"))
+    data = path.read_bytes()
+    whole = [data.find(b"mdat") + 2000]
+
+    def serve(request):
+        begin = int((request.headers.get("Range") or "bytes=0-")[6:-1] or 0)
+        request.send_response(206 if begin else 200)
+        request.send_header("Accept-Ranges", "bytes")
+        request.send_header("Content-Length", str(len(data) - begin))
+        if begin:
+            request.send_header("Content-Range", f"bytes {begin}-{len(data) - 1}/{len(data)}")
+        request.end_headers()
+        request.wfile.write(data[begin : whole[0]])
+        for place in range(max(whole[0], begin), len(data)):
+            request.wfile.write(data[place : place + 1])
+            time.sleep(0.2)
+
+    for module in (ffmpeg_module, reading, remote):
+        monkeypatch.setattr(module, "NETWORK_DEADLINE", 1.5)
+    with server(serve) as address:
+        with pytest.raises(TransientVideoError, match=r"slow.mp4 cannot be copied \(only"):
+            remote.download(f"{address}/slow.mp4", tmp_path)
+        whole[0] = 100
+        with pytest.raises(TransientVideoError, match="sends too little data for a frame"):
+            open_source(f"{address}/slow.mp4")
 
 
 def stream_of(data):

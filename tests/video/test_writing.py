@@ -11,10 +11,11 @@ from types import SimpleNamespace
 
 import pytest
 from moviepy import VideoFileClip
+from moviepy.config import FFMPEG_BINARY
 
 from tests.helpers import StubDetector
 from tests.video.clips import NTSC, ffmpeg, ffmpeg_log, frame_numbers, sound_seconds
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.errors import InvalidInputError, TransientVideoError
 from vehicle_detection.video import VideoReport, engine, open_source, probe_video, process_video, read_frames
 
 
@@ -181,6 +182,26 @@ def test_a_read_only_folder_and_an_unreadable_file(clip, tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     with pytest.raises(InvalidInputError, match="is not readable; change its permissions"):
         probe_video(clip)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the program in place of ffmpeg is a shell script")
+@pytest.mark.parametrize("action", [":", "head -c 100 /dev/zero > ", "head -c 3000 {clip} > ", "cp {clip} "])
+def test_an_encoder_that_writes_nothing_or_garbage_replaces_nothing(clip, tmp_path, monkeypatch, action):
+    """It reads all frames, and ends with the exit code 0."""
+    program, target = tmp_path / "ffmpeg.sh", tmp_path / "out.mp4"
+    program.write_text(
+        f"""#!/bin/sh
+for last in "$@"; do last=${{last#file:}}; done
+case "$*" in *libx264*) cat > /dev/null; {action.format(clip=clip)}"$last"; exit 0;; esac
+exec "{FFMPEG_BINARY}" "$@"
+"""
+    )
+    program.chmod(0o755)
+    monkeypatch.setattr("moviepy.config.FFMPEG_BINARY", str(program))
+    target.write_text("old")
+    with pytest.raises(TransientVideoError, match=r"ffmpeg wrote \d+ of 12 frames.*nothing of it was kept"):
+        process_video(clip, target, StubDetector(), end=0.4)
+    assert target.read_text() == "old"
 
 
 @pytest.mark.parametrize("name", ["-dash.mp4", "a:b.mp4", "100%d.mp4", "spaced name é.mp4", "http:x.mp4"])

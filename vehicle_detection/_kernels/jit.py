@@ -5,7 +5,11 @@ from __future__ import annotations
 import contextlib
 import functools
 import gc
+import getpass
 import logging
+import os
+import stat
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -29,10 +33,15 @@ def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[...,
         no_cfunc_wrapper=True,
         fastmath={"reassoc", "contract", "nsz"} if reorder else False,
     )
-    try:
+    kernel: Any = None
+    with contextlib.suppress(RuntimeError):  # neither the package's folder nor the user's cache is writable
         kernel = compiler(cache=True)(function)
-    except RuntimeError:
-        # Neither the package's folder nor the user's cache is writable: compile in every process.
+    if kernel is None and (folder := _temporary_cache()):
+        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, folder
+        with contextlib.suppress(RuntimeError):
+            kernel = compiler(cache=True)(function)
+        numba.config.CACHE_DIR = before
+    if kernel is None:
         return compiler()(function)  # type: ignore[no-any-return]
     # These attributes are not public. Without them, numba notices changes of the kernel's own file only, not
     # of those that it calls, and fails on a full disk.
@@ -40,6 +49,28 @@ def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[...,
         kernel._cache._cache_file._source_stamp = source_stamp()
         kernel._cache.save_overload = functools.partial(_save, kernel._cache.save_overload)
     return kernel  # type: ignore[no-any-return]
+
+
+@functools.cache
+def _temporary_cache() -> str:
+    """Return a temporary folder for kernels, which no other user can write; empty if there is none."""
+    user = os.getuid() if hasattr(os, "getuid") else getpass.getuser()
+    try:
+        folder = Path(tempfile.gettempdir(), f"vehicle-detection-kernels-{user}")
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+    except OSError:
+        status = None
+    if status is None or not stat.S_ISDIR(status.st_mode) or _is_shared(status):
+        log.warning("no folder for compiled kernels is writable: each process compiles them, for 15 s")
+        return ""
+    log.warning("the package and the user's cache are not writable: compiled kernels are kept in %s", folder)
+    return str(folder)
+
+
+def _is_shared(status: os.stat_result) -> bool:
+    """Whether another user may write to a folder, and so choose the code that is loaded from it."""
+    return hasattr(os, "getuid") and (status.st_uid != os.getuid() or bool(status.st_mode & 0o022))
 
 
 def _save(save: Callable[..., None], *overload: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -134,12 +135,15 @@ def _open(options: VideoOptions) -> Iterator[tuple[FrameSource, vd.VehicleDetect
     """Open the source and the detector; its horizon is estimated first if the option says so."""
     drawing: dict[str, Any] = {"diagnostics": options.diagnostics, "blur": options.blur}
     speed = read_speed(options.own_speed, options.gpx, options.gpx_offset)
-    annotator = vd.Annotator(options.draw_params(), own_speed=speed, **drawing)
+    style = options.draw_params()
     camera = vd.open_camera(
         options.camera, fov=options.fov, height_m=options.camera_height, horizon=options.stated_horizon()
     )
     model = open_model(options.model, options.classes, options.device)
     with options.open_source() as source:
+        if speed is not None:
+            speed = replace(speed, clock=vd.drive.segment_clock(source))
+        annotator = vd.Annotator(style, own_speed=speed, **drawing)
         if options.why and not source.rereadable:
             raise InvalidInputError(
                 f"--why needs a source that can be read again, got {options.source}; use a file, or omit it"

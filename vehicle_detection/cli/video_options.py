@@ -65,14 +65,19 @@ class VideoOptions:
     profile: bool = output_flag("--profile", "Print the time of each stage.")
     start: str | None = input_option(None, "TIME", "Start time, such as 12.5 (seconds) or 12:30.")
     end: str | None = input_option(None, "TIME", "End time, such as 30 (seconds) or 1:02:06.")
-    fps: float = input_option(25.0, "N", "Frame rate of a source of images, such as 10.")
+    fps: float | None = input_option(
+        None, "N", "Frame rate of images, a raw stream such as .h264, a pipe or a camera, such as 10."
+    )
+    stream: int | None = input_option(
+        None, "N", "Video stream of a file with several, by ffmpeg's number, such as 1."
+    )
     own_speed: str | None = input_option(
         None, "SPEED", "Own speed in km/h, such as 100, or 62mph, for headways and speeds over ground."
     )
     gpx: Path | None = input_option(
         None,
         "FILE",
-        "Own speed over time: a GPX track, or a .csv table with the columns time_s and speed_kmh.",
+        "Own speed over time: a GPX track, NMEA sentences, or a .csv table with time_s and speed_kmh.",
     )
     gpx_offset: float = input_option(
         0.0,
@@ -138,4 +143,5 @@ class VideoOptions:
     def open_source(self) -> FrameSource:
         """Open the source."""
         options: dict[str, Any] = {"live": self.live or None, "reconnect": not self.no_reconnect}
-        return vd.open_trip(self.source, fps=self.fps, strict=self.strict, **options)
+        options |= {"fps": self.fps, "stream": self.stream, "strict": self.strict}
+        return vd.open_trip(self.source, **options)

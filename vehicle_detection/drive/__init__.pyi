@@ -6,7 +6,7 @@ from .own_speed import OwnSpeed, own_speeds, read_own_speed
 from .report import ReportWriter, explain_tracks
 from .report_page import TrackPicture
 from .subtitles import SUBTITLE_SUFFIXES, write_subtitles
-from .trips import Trip, find_trips, open_trip
+from .trips import Trip, find_trips, open_trip, segment_clock
 from .worker_pool import open_dask
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
     "own_speeds",
     "read_own_speed",
     "run_batch",
+    "segment_clock",
     "with_source",
     "write_events",
     "write_subtitles",

@@ -26,9 +26,9 @@ from vehicle_detection._common import (
     local_path,
     stable_url,
 )
-from vehicle_detection.drive.trips import Trip, find_trips
-from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
-from vehicle_detection.video import is_video_file, open_filesystem, probe_video, walk_files, with_retries
+from vehicle_detection.drive.trips import Trip, find_trips, probe_length
+from vehicle_detection.errors import InvalidInputError, TransientVideoError
+from vehicle_detection.video import is_video_file, open_filesystem, walk_files, with_retries
 
 _ID_DIGITS = _HASH_DIGITS = 12
 _HTTP_TIMEOUT = 10
@@ -118,17 +118,9 @@ def group_files(files: Sequence[str], group: str) -> list[Trip]:
     needed: dict[Path | str, float] = {}
     find_trips(named, duration=lambda file: needed.setdefault(file, 0.0))
     with ThreadPoolExecutor(available_cores(), thread_name_prefix="vehicle-probe") as pool:
-        needed = dict(zip(needed, pool.map(_duration, needed), strict=True))
+        needed = dict(zip(needed, pool.map(probe_length, needed), strict=True))
     # Others are needed if modification times have changed in the meantime.
-    return find_trips(named, duration=lambda file: needed[file] if file in needed else _duration(file))
-
-
-def _duration(file: Path | str) -> float:
-    """Length of a local video in seconds; 0 if it is unknown, so that a new trip begins after it."""
-    try:
-        return 0.0 if is_url(str(file)) else probe_video(file).duration
-    except (InvalidInputError, VideoError):  # reported when its trip is processed
-        return 0.0
+    return find_trips(named, duration=lambda file: needed[file] if file in needed else probe_length(file))
 
 
 def trip_id(trip: Trip) -> str:

@@ -1,13 +1,14 @@
-"""Speed of the camera's own vehicle over time, from a GPX track or a CSV table."""
+"""Speed of the camera's own vehicle over time, from a GPX track, NMEA sentences or a CSV table."""
 
 from __future__ import annotations
 
 import csv
+import functools
 import io
+import logging
 import math
 import os
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
     Floats,
@@ -24,6 +25,7 @@ from vehicle_detection._common import (
     check_number,
     check_path,
     describe,
+    pluralize,
     read_regular_file,
     shorten,
     store_number,
@@ -31,12 +33,20 @@ from vehicle_detection._common import (
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tables import TrackTable
 
+_LOGGER = logging.getLogger(__name__)
+
 # Gap (s) between two values from which on the speed between them is unknown.
 _MAX_GAP = 5.0
 # Span (s) of the positions that give a speed: single positions have errors of some meters.
 _SPAN = 3.0
 _EARTH_RADIUS = 6_371_009.0  # m
 _MAX_SPEED = 150.0  # m/s
+_UNUSUAL_SPEED = 70.0  # m/s, above which the unit is probably another one
+# Speed (m/s) by the positions above which they show the unit of the stated speed, and the number of points.
+_MOVING, _MOVING_POINTS = 5.0, 5
+# Units in which stated speeds are found, in place of m/s: values for 1 m/s.
+_OTHER_UNITS = {"km/h": 3.6, "mph": 1 / 0.44704, "knots": 3600 / 1852}
+_OUTLYING = 366 * 86400.0  # s from the median time, such as the dates of a receiver without satellites
 # Factors from the columns of a table to m/s.
 _SPEED_COLUMNS = {"speed_mps": 1.0, "speed_kmh": 1 / 3.6, "speed_mph": 0.44704}
 
@@ -55,6 +65,8 @@ class OwnSpeed:
     seconds: Floats  # (N,) ascending times; 0 is the start of the video
     speeds_mps: Floats  # (N,) speeds over ground in m/s, at least 0
     max_gap: float = _MAX_GAP  # seconds between two times from which on the speed is unknown
+    # Times of the video and of the record from which on they differ, as `segment_clock` returns them.
+    clock: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("seconds", "speeds_mps"):
@@ -94,6 +106,9 @@ class OwnSpeed:
                 f"seconds must be numbers, got {describe(seconds)}; pass times in seconds"
             )
         times: Floats = given.astype(np.float64)
+        if self.clock:
+            played, recorded = np.array(self.clock).T
+            times = times + (recorded - played)[np.maximum(np.searchsorted(played, times, "right") - 1, 0)]
         speeds = np.interp(times, self.seconds, self.speeds_mps, left=np.nan, right=np.nan)
         if len(self.seconds) > 1:
             after = np.clip(np.searchsorted(self.seconds, times), 1, len(self.seconds) - 1)
@@ -116,12 +131,16 @@ def own_speeds(speed: OwnSpeed, table: TrackTable, *, fps: float) -> Floats:
 def read_own_speed(path: str | os.PathLike[str], *, offset: float = 0.0) -> OwnSpeed:
     r"""Read the speed of the camera's own vehicle.
 
+    Stated speeds are compared with the positions: those in another unit are converted, and zeros while the
+    positions move are replaced, with a warning; others that differ are an error.
+
     Parameters
     ----------
     path
-        ``.gpx``: a GPS track with times. Its speeds are used if it holds them, otherwise they are computed
-        from positions 3 s apart. ``.csv``: a table with a header and the columns ``time_s`` and one of
-        ``speed_mps``, ``speed_kmh`` and ``speed_mph``; other columns are ignored.
+        ``.gpx``: a GPS track with times. ``.nmea``: RMC sentences. ``.csv``: a table with a header and the
+        columns ``time_s``, one of ``speed_mps``, ``speed_kmh`` and ``speed_mph``, and perhaps ``latitude``
+        and ``longitude``; other columns are ignored. Where no speed is stated, it is computed from positions
+        3 s apart.
     offset
         Time of the video's start in the record: seconds after the first point of a track, or the value of
         ``time_s``. Negative if the record starts later than the video.
@@ -137,12 +156,90 @@ def read_own_speed(path: str | os.PathLike[str], *, offset: float = 0.0) -> OwnS
     check_path(path, "path")
     file = Path(path)
     shift = check_number(offset, "offset", low=-1e9, high=1e9)
-    reader = {".gpx": _read_gpx, ".csv": _read_csv}.get(file.suffix.lower())
+    readers = {".gpx": _read_gpx, ".nmea": _read_nmea, ".csv": _read_csv}
+    reader = readers.get(file.suffix.lower())
     if reader is None:
-        raise InvalidInputError(f"path must end in .gpx or .csv, got {file.name!r}; convert the record")
-    rows = reader(read_regular_file(file, f"path {file}", Limit.RECORD_BYTES), str(file))
-    seconds, speeds = _ascending(np.array(rows)).T
+        raise InvalidInputError(
+            f"path must end in {' or '.join(readers)}, got {file.name!r}; convert the record"
+        )
+    points = reader(read_regular_file(file, f"path {file}", Limit.RECORD_BYTES), str(file))
+    if reader is not _read_csv:
+        points = _from_first_point(points, str(file))
+    seconds, speeds = _plausible_speeds(points, str(file))
     return OwnSpeed(seconds - shift, speeds)
+
+
+def _from_first_point(points: Floats, name: str) -> Floats:
+    """Sort points by time, leave out those with dates far from all others, and count from the first one."""
+    points = _ascending(points[np.isfinite(points[:, 0])])
+    if len(points):
+        outlying = np.abs(points[:, 0] - np.median(points[:, 0])) > _OUTLYING
+        if outlying.any():
+            date = datetime.fromtimestamp(points[outlying][0, 0], UTC).date()
+            count = pluralize(int(outlying.sum()), "point")
+            _LOGGER.warning("%s: left out %s years from the others, such as of %s", name, count, date)
+        points = points[~outlying]
+    if len(points) < 2:
+        raise InvalidInputError(
+            f"path {name} must have at least two track points with times, got {len(points)}; export a "
+            "recorded track, not a route"
+        )
+    return points - [points[0, 0], 0, 0, 0]
+
+
+def _plausible_speeds(points: Floats, name: str) -> tuple[Floats, Floats]:
+    """Return times (s) and speeds (m/s) of points: time, stated speed (m/s), latitude, longitude, or NaN."""
+    times, stated = points[:, 0], points[:, 1]
+    by_position = _speeds_of(points)
+    moving = (by_position > _MOVING) & np.isfinite(stated)
+    zero = moving & (stated == 0)
+    if zero.sum() >= _MOVING_POINTS:
+        first = int(np.argmax(zero))
+        _LOGGER.warning(
+            "%s: the speed is 0 at %d points, such as %g s after the first one, where the positions move by "
+            "%.0f km/h; the positions are used there",
+            *(name, zero.sum(), times[first] - times[0], by_position[first] * 3.6),
+        )
+        stated, moving = np.where(zero, np.nan, stated), moving & ~zero
+    if moving.sum() >= _MOVING_POINTS:
+        stated = stated / _unit_of(times - times[0], stated, by_position, moving, name)
+    stated = np.where(stated <= _MAX_SPEED, stated, np.nan)
+    speeds = np.where(np.isfinite(stated), stated, np.minimum(by_position, _MAX_SPEED))
+    known = np.isfinite(speeds)
+    if not known.any():
+        raise InvalidInputError(
+            f"path {name} has no speeds, and no positions at most {_MAX_GAP:g} s apart to compute them; "
+            "record them every second"
+        )
+    fastest = int(np.nanargmax(speeds))
+    if speeds[fastest] > _UNUSUAL_SPEED:
+        _LOGGER.warning(
+            "%s: the speed is %.0f km/h %g s after the first point; check its unit",
+            *(name, speeds[fastest] * 3.6, times[fastest] - times[0]),
+        )
+    return times[known], speeds[known]
+
+
+def _unit_of(
+    seconds: Floats, stated: Floats, by_position: Floats, moving: NDArray[np.bool_], name: str
+) -> float:
+    """Return the unit of stated speeds, as its value for 1 m/s; an error if it is none."""
+    ratios = stated[moving] / by_position[moving]
+    ratio = float(np.median(ratios))
+    if 0.75 < ratio < 1.33:
+        return 1.0
+    unit, value = min(_OTHER_UNITS.items(), key=lambda each: abs(each[1] / ratio - 1))
+    if abs(value / ratio - 1) > 0.07 or np.mean(np.abs(ratios / ratio - 1) < 0.15) < 0.8:
+        at = int(np.argmax(moving))
+        raise InvalidInputError(
+            f"path {name}: {seconds[at]:g} s after the first point, the speed is {stated[at]:.1f} m/s, but "
+            f"the positions move by {by_position[at]:.1f} m/s, and others differ as well (median ratio "
+            f"{ratio:.2f}); correct the speeds, or leave them out"
+        )
+    _LOGGER.warning(
+        "%s: the speeds are %.2f times those of the positions, so they are read as %s", name, ratio, unit
+    )
+    return value
 
 
 def _ascending(rows: Floats) -> Floats:
@@ -151,8 +248,8 @@ def _ascending(rows: Floats) -> Floats:
     return rows[np.diff(rows[:, 0], prepend=-np.inf) > 0]
 
 
-def _read_csv(data: bytes, name: str) -> Sequence[tuple[float, float]]:
-    """Read times (s) and speeds (m/s) of a table."""
+def _read_csv(data: bytes, name: str) -> Floats:
+    """Read the points of a table."""
     try:
         table = list(csv.reader(io.StringIO(data.decode("utf-8-sig"), newline="")))
     except (UnicodeDecodeError, csv.Error) as error:
@@ -164,13 +261,13 @@ def _read_csv(data: bytes, name: str) -> Sequence[tuple[float, float]]:
             f"path {name} must have the columns time_s and one of {', '.join(_SPEED_COLUMNS)}; "
             f"got {shorten(', '.join(header), 300) or 'no header'}"
         )
-    columns = header.index("time_s"), header.index(unit)
+    place = [header.index(column) for column in ("latitude", "longitude") if column in header]
     rows = []
     for number, row in enumerate(table[1:], start=2):
         if not any(cell.strip() for cell in row):
             continue
         try:
-            time, speed = (float(row[column]) for column in columns)
+            time, speed = (float(row[header.index(column)]) for column in ("time_s", unit))
         except (ValueError, IndexError):
             raise InvalidInputError(
                 f"path {name}, line {number}: time_s and {unit} must be numbers; correct the line"
@@ -181,10 +278,18 @@ def _read_csv(data: bytes, name: str) -> Sequence[tuple[float, float]]:
                 f"path {name}, line {number}: the speed must be from 0 to {_MAX_SPEED:g} m/s at a finite "
                 f"time; got {shorten(','.join(row))}"
             )
-        rows.append((time, speed))
+        cells = [row[column] if column < len(row) else "" for column in place]
+        rows.append((time, speed, *(_position(*cells) if len(cells) == 2 else _NOWHERE)))
     if not rows:
         raise InvalidInputError(f"path {name} has no rows below its header")
-    return rows
+    return _ascending(np.array(rows))
+
+
+_NOWHERE = (math.nan, math.nan)
+
+
+def _position(latitude: str | None, longitude: str | None) -> tuple[float, float]:
+    return _parse_float(latitude, -90, 90), _parse_float(longitude, -180, 180)
 
 
 class _NoDoctype(ElementTree.TreeBuilder):
@@ -214,7 +319,7 @@ def _parse_time(text: str) -> float:
 
 
 def _read_gpx(data: bytes, name: str) -> Floats:
-    """Read times (s) since the first point, and speeds (m/s), of the points of a GPX document."""
+    """Read the points of a GPX document, with times since 1970."""
     parser = ElementTree.XMLParser(target=_NoDoctype())
     try:
         parser.feed(data)
@@ -227,41 +332,53 @@ def _read_gpx(data: bytes, name: str) -> Floats:
     rows = [
         (
             _parse_time(point.findtext(".//{*}time") or ""),
-            _parse_float(point.findtext(".//{*}speed"), 0, _MAX_SPEED),
-            _parse_float(point.get("lat"), -90, 90),
-            _parse_float(point.get("lon"), -180, 180),
+            _parse_float(point.findtext(".//{*}speed"), 0, 4 * _MAX_SPEED),
+            *_position(point.get("lat"), point.get("lon")),
         )
         for point in document.iterfind(".//{*}trkpt")
     ]
-    points = _ascending(np.array([row for row in rows if math.isfinite(row[0])]).reshape(-1, 4))
-    if len(points) < 2:
-        raise InvalidInputError(
-            f"path {name} must have at least two track points with times, got {len(points)}; export a "
-            "recorded track, not a route"
-        )
-    times, speeds = points[:, 0] - points[0, 0], points[:, 1]
-    if np.isfinite(speeds).mean() < 0.5:
-        latitude, longitude = np.deg2rad(points[:, 2:]).T
-        known = np.isfinite(latitude) & np.isfinite(longitude)
-        times, latitude, longitude = times[known], latitude[known], longitude[known]
-        steps = np.diff(times)
-        jumps = _great_circle(latitude[:-1], longitude[:-1], latitude[1:], longitude[1:]) > _MAX_SPEED * steps
-        breaks = np.flatnonzero((steps > _MAX_GAP) | jumps) + 1
-        parts = np.split(np.column_stack([times, latitude, longitude]), breaks)
-        speeds = np.concatenate([_speeds_of(*part.T) for part in parts])
-    known = np.isfinite(speeds)
-    if not known.any():
-        raise InvalidInputError(
-            f"path {name} has no speeds, and no positions at most {_MAX_GAP:g} s apart to compute them; "
-            "record them every second"
-        )
-    return np.column_stack([times[known], np.minimum(speeds[known], _MAX_SPEED)])
+    return np.array(rows).reshape(-1, 4)
 
 
-def _speeds_of(times: Floats, latitude: Floats, longitude: Floats) -> Floats:
+_RMC = re.compile(
+    r"\$(?P<text>G[A-Z]RMC,(\d\d)(\d\d)(\d\d(?:\.\d+)?),A,(\d\d)([\d.]+),([NS]),(\d{3})([\d.]+),([EW]),"
+    r"([\d.]*),[^,]*,(\d\d)(\d\d)(\d\d)[^*\s]*)\*(?P<sum>[0-9A-F]{2})"
+)
+
+
+def _read_nmea(data: bytes, name: str) -> Floats:
+    """Read the points of valid RMC sentences, with times since 1970."""
+    rows = []
+    for found in _RMC.finditer(data.decode("ascii", "replace")):
+        _, hour, minute, second, lat, lat_minutes, south, lon, lon_minutes, west, knots, *date, check = (
+            found.groups()
+        )
+        if functools.reduce(lambda bits, letter: bits ^ ord(letter), found["text"], 0) == int(check, 16):
+            day, month, year = date
+            time = _parse_time(f"20{year}-{month}-{day}T{hour}:{minute}:{second[:2]}")
+            north = (int(lat) + float(lat_minutes) / 60) * (-1 if south == "S" else 1)
+            east = (int(lon) + float(lon_minutes) / 60) * (-1 if west == "W" else 1)
+            speed = _parse_float(knots, 0, 4 * _MAX_SPEED) / _OTHER_UNITS["knots"]
+            rows.append((time + float(second) % 1, speed, *_position(str(north), str(east))))
+    return np.array(rows).reshape(-1, 4)
+
+
+def _speeds_of(points: Floats) -> Floats:
+    """Speeds (m/s) by the positions of points; NaN where they are unknown, far apart in time, or jump."""
+    speeds = np.full(len(points), np.nan)
+    known = np.flatnonzero(np.isfinite(points[:, 2:]).all(axis=1))
+    times, (latitude, longitude) = points[known, 0], np.deg2rad(points[known, 2:]).T
+    steps = np.diff(times)
+    jumps = _great_circle(latitude[:-1], longitude[:-1], latitude[1:], longitude[1:]) > _MAX_SPEED * steps
+    breaks = np.flatnonzero((steps > _MAX_GAP) | jumps) + 1
+    for part in np.split(np.arange(len(known)), breaks):
+        if len(part) > 1:
+            speeds[known[part]] = _smooth_speeds(times[part], latitude[part], longitude[part])
+    return speeds
+
+
+def _smooth_speeds(times: Floats, latitude: Floats, longitude: Floats) -> Floats:
     """Speeds (m/s) from positions (radians): distance along the great circle between positions 3 s apart."""
-    if len(times) < 2:
-        return np.full(len(times), np.nan)
     first = np.clip(times - _SPAN / 2, times[0], max(times[-1] - _SPAN, times[0]))
     last = np.minimum(first + _SPAN, times[-1])
     # A track that crosses the date line has no jump in its unwrapped longitude.

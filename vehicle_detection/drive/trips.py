@@ -2,16 +2,18 @@
 
 A file name contains the camera and either the time of the first frame (``20260131_081500_F.MP4``,
 ``2026-01-31_08-15-00-front.mp4``) or a running number of four digits (``GRMN0001.MP4``, ``GX010042.MP4``).
-With a number, the modification times show whether there is a gap, unless the files were copied without them.
+A segment follows another one if it starts when the other ends: names hold the start of a segment, and the
+modification time of a numbered file is its end, unless the file was copied without it.
 """
 
 from __future__ import annotations
 
 import contextlib
 import itertools
+import logging
 import os
 import re
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -19,8 +21,10 @@ from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
 from vehicle_detection._common import check_sequence, describe, is_url, pluralize
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video import FrameSource, Source, is_video_file, list_files, open_source, probe_video
+from vehicle_detection.errors import InvalidInputError, VideoError
+from vehicle_detection.video import FrameSource, Source, is_video_file, list_files, open_source
+
+_LOGGER = logging.getLogger(__name__)
 
 File = Path | str
 
@@ -33,19 +37,30 @@ _TIME = re.compile(
     r"(?<!\d)(20\d{2})[-_.]?(\d{2})[-_.]?(\d{2})[-_. T]{0,3}(\d{2})[-_.h]?(\d{2})[-_.m]?(\d{2})(?!\d{6})"
 )
 # Nextbase, whose years have two digits: 260131_081500_001_FH.MP4.
-_SHORT_TIME = re.compile(r"^(\d{2})(\d{2})(\d{2})_(\d{2})(\d{2})(\d{2})(?=_\d{3}_[A-Z]{2}$)", re.IGNORECASE)
+_SHORT_TIME = re.compile(r"^(\d{2})(\d{2})(\d{2})_(\d{2})(\d{2})(\d{2})(?=_\d{3}_[A-Z]{2}(?:_|$))", re.I)
 # A number that counts the files of a camera, perhaps with a letter or two for the kind of recording.
 _COUNTER = re.compile(r"(?<!\d)\d{3,}(?=[A-Za-z]{0,2}(?![A-Za-z0-9]))")
-_GOPRO = re.compile(r"^G[HXLP](\d{2})(\d{4})$", re.IGNORECASE)
+# Chapters of one recording of a GoPro: GH010042, GH020042; up to HERO5 GOPR0042, GP010042. GL: low
+# resolution. community.gopro.com, "Camera File Naming Convention"
+_GOPRO = re.compile(r"^G(?:OPR|([HXLPS])(\d{2}))(\d{4})$", re.IGNORECASE)
+# What follows the time in the names of a maker, without counters: a letter for the camera, and one for copies
+# in low resolution, which are other trips.
+_MAKERS = (
+    # BlackVue: the kind of recording first (acolomba/blackvuesync on GitHub); Viofo: P for parking; 70mai;
+    # Thinkware.
+    (
+        re.compile(r"^[-_]+[NEPMIOATBRXGDLYF]?([FRBI])L?(S?)$"),
+        {"F": "front", "R": "rear", "B": "rear", "I": "interior"},
+    ),
+    # Nextbase, of iQ with the kind of event (support.nextbase.com, "File Names").
+    (re.compile(r"^__([FRC])(?:H|(L))(?:_[A-Z]+)?$"), {"F": "front", "R": "rear", "C": "interior"}),
+    # Vantrue: the kind of recording first; cameras in the order of N4 and N5 (dashcamigo on GitHub).
+    (re.compile(r"^__[A-Z]_([ABC])()$"), {"A": "front", "B": "interior", "C": "rear"}),
+)
 _CAMERA_WORDS = {
     "front": "front", "rear": "rear", "back": "rear", "left": "left", "right": "right",
     "interior": "interior", "inside": "interior", "cabin": "interior", "in": "interior",
     "f": "front", "r": "rear", "b": "rear", "i": "interior",
-    # BlackVue: an event letter before the camera's.
-    "nf": "front", "ef": "front", "pf": "front", "mf": "front",
-    "nr": "rear", "er": "rear", "pr": "rear", "mr": "rear",
-    # Nextbase, in high resolution; copies in low resolution are other trips.
-    "fh": "front", "rh": "rear",
 }  # fmt: skip
 # Folders with names of letters alone are not named after a camera.
 _CAMERA_FOLDERS = {word: camera for word, camera in _CAMERA_WORDS.items() if len(word) >= 4}
@@ -62,6 +77,7 @@ class _Segment:
     series: str  # name without time, number and camera; numbers of one series follow each other
     number: int | None
     end: float | None = None  # modification time, where the name has no time
+    chapter: bool = False  # the number counts the parts of one recording
 
 
 @dataclass(frozen=True)
@@ -75,6 +91,7 @@ class Trip:
     files: tuple[File, ...]  # in order: paths, or URLs
     camera: str  # front, rear, left, right, interior or unknown
     start: datetime | None = None  # of the first frame by the camera's clock, if the name contains it
+    gap_s: float | None = None  # after the trip before it, where known; negative if they overlap
 
     def __str__(self) -> str:
         camera = "" if self.camera == UNKNOWN_CAMERA else f"{self.camera}, "
@@ -82,25 +99,26 @@ class Trip:
 
 
 def find_trips(files: Iterable[File], *, duration: Callable[[File], float] | None = None) -> list[Trip]:
-    """Group files into trips, by their folders and names.
+    """Group files into trips, by their folders, names and lengths.
 
     A segment follows another one of the same folder and camera if it starts when the other ends, by the times
-    in the names; or if it has the next number of four digits, and the modification times leave no gap.
-    Front and rear cameras are different trips.
+    in the names; or if it has the next number of four digits, and the modification times leave no gap. Where
+    these are not those of the camera, the numbers decide, with a warning. Gaps and overlaps begin another
+    trip. Front and rear cameras are different trips.
 
     Parameters
     ----------
     files
         Paths or URLs of videos, in any order. The trips are ordered by folder, camera and time.
     duration
-        Function that returns the length of a file in seconds; called only where the times in the names leave
-        open whether there is a gap. None: such segments are different trips.
+        Function that returns the length of a file in seconds, or 0 if it is unknown: then the next segment is
+        another trip. None: files and web addresses are probed.
 
     Examples
     --------
     >>> names = ["20260131_081500_F.MP4", "20260131_081600_F.MP4", "20260131_081700_F.MP4"]
     >>> names += ["20260131_081500_R.MP4", "20260131_093000_F.MP4"]
-    >>> for trip in find_trips(names):
+    >>> for trip in find_trips(names, duration=lambda name: 60.0):
     ...     print(trip.camera, trip.start, len(trip.files))
     front 2026-01-31 08:15:00 3
     front 2026-01-31 09:30:00 1
@@ -123,8 +141,20 @@ def find_trips(files: Iterable[File], *, duration: Callable[[File], float] | Non
             groups[key],
             key=lambda pair: (pair[0].start or datetime.min, pair[0].number or 0, _posix(pair[1]).name),
         )
-        trips += _split(members, duration)
+        trips += _split(members, duration or probe_length)
     return trips
+
+
+def probe_length(file: File) -> float:
+    """Length of a video in seconds; 0 if it is unknown, as on storage from which it would be copied."""
+    text = str(file)
+    try:
+        if is_url(text) and not text.startswith(("http://", "https://")):
+            return 0.0
+        with open_source(file) as source:
+            return source.info.duration
+    except (InvalidInputError, VideoError):  # reported when its trip is processed
+        return 0.0
 
 
 def open_trip(source: Source, **options: Any) -> FrameSource:
@@ -141,9 +171,9 @@ def open_trip(source: Source, **options: Any) -> FrameSource:
     """
     files = list_files(source) if isinstance(source, (str, os.PathLike)) else []
     if len(files) > 1 and is_video_file(files[0]):
-        trips = find_trips(files, duration=lambda each: probe_video(each).duration)
+        trips = find_trips(files)
         if len(trips) > 1:
-            listed = "; ".join(f"{trip} from {Path(trip.files[0]).name}" for trip in trips[:4])
+            listed = "; ".join(f"{trip} from {Path(trip.files[0]).name}{_gap(trip)}" for trip in trips[:4])
             example = files[0].parent / f"*{Path(trips[0].files[0]).name[-5:]}"
             raise InvalidInputError(
                 f"source {source} holds {len(trips)} trips ({listed}{', ...' if len(trips) > 4 else ''}); "
@@ -151,6 +181,30 @@ def open_trip(source: Source, **options: Any) -> FrameSource:
             )
         source = trips[0].files
     return open_source(source, **options)
+
+
+def _gap(trip: Trip) -> str:
+    if trip.gap_s is None:
+        return ""
+    return f", {abs(trip.gap_s):.0f} s {'after' if trip.gap_s > 0 else 'before'} the end of the one before"
+
+
+def segment_clock(source: FrameSource) -> tuple[tuple[float, float], ...]:
+    """Seconds of a trip's video, and of the camera's clock since the first frame, from which on they differ.
+
+    Such as after pauses between segments; steps of up to a second are those of the names. Empty without times
+    in the names.
+    """
+    starts = [_parse_name(_posix(file)).start for file in source.files]
+    clock, offset = list[tuple[float, float]](), 0.0
+    for begin, start in zip(source.segment_starts, starts):
+        if start is None or starts[0] is None:
+            return ()
+        elapsed = (start - starts[0]).total_seconds()
+        if not clock or abs(elapsed - begin - offset) > 1:
+            offset = elapsed - begin
+            clock.append((begin, elapsed))
+    return tuple(clock)
 
 
 def _posix(file: File) -> PurePosixPath:
@@ -166,25 +220,34 @@ def _parse_name(name: PurePosixPath) -> _Segment:
     stem = name.stem
     gopro = _GOPRO.match(stem)
     if gopro:  # the chapter comes before the number of the recording
-        return _Segment(_folder_camera(name), None, f"gopro {gopro[2]}", int(gopro[1]))
-    start, rest = None, stem
+        low = "low " if gopro[1] in ("L", "l") else ""
+        series = f"gopro {low}{gopro[3]}"
+        return _Segment(_folder_camera(name), None, series, int(gopro[2] or 0), chapter=True)
+    start, rest, camera = None, stem, None
     found = _SHORT_TIME.search(stem) or _TIME.search(stem)
     if found:
         year, *others = (int(part) for part in found.groups())
         with contextlib.suppress(ValueError):  # not a time after all
             start = datetime(year if year >= 100 else 2000 + year, *others)  # type: ignore[arg-type]
             # With a time, a counter adds nothing; other numbers are those of vehicles and channels.
-            rest = f"{stem[: found.start()]} {_COUNTER.sub('', stem[found.end() :])}"
-    camera, rest = _take_camera(rest, codes=start is not None)
+            camera, after = _take_code(_COUNTER.sub("", stem[found.end() :]))
+            rest = f"{stem[: found.start()]} {after}"
+    if camera is None:
+        camera, rest = _take_camera(rest, codes=start is not None)
     if camera is None:
         camera = _folder_camera(name)
-    numbers = re.findall(r"\d{4,}", stem if start else rest)
+    numbers = [] if start else re.findall(r"\d{4,}", rest)
     number = int(numbers[-1]) if numbers else None
-    if start:
-        series = re.sub(r"(?<![A-Za-z0-9])\d{3,}(?![A-Za-z0-9])", "", rest)
-    else:
-        series = re.sub(r"\d+(?=\D*$)", "#", rest)
-    return _Segment(camera, start, series.strip(" _-.").lower(), number)
+    counter, kept = (r"(?<![A-Za-z0-9])\d{3,}(?![A-Za-z0-9])", "") if start else (r"\d+(?=\D*$)", "#")
+    return _Segment(camera, start, re.sub(counter, kept, rest).strip(" _-.").lower(), number)
+
+
+def _take_code(text: str) -> tuple[str | None, str]:
+    """Find the camera by what a maker writes after the time, and return what else tells trips apart."""
+    for pattern, cameras in _MAKERS:
+        if code := pattern.match(text.upper()):
+            return cameras[code[1]], code[2] or ""
+    return None, text
 
 
 def _take_camera(stem: str, *, codes: bool) -> tuple[str | None, str]:
@@ -209,40 +272,53 @@ def _folder_camera(name: PurePosixPath) -> str:
     return UNKNOWN_CAMERA
 
 
-def _split(members: Sequence[tuple[_Segment, File]], duration: Callable[[File], float] | None) -> list[Trip]:
+def _split(members: Sequence[tuple[_Segment, File]], duration: Callable[[File], float]) -> list[Trip]:
     """Split the sorted files of one camera where a segment does not follow the one before."""
-    steps = [_step(before, after) for (before, _), (after, _) in itertools.pairwise(members)]
-    usual = _usual_step([step for step in steps if step is not None])
-    by_number = members[0][0].start is None
-    trips = [[members[0]]]
-    for before, after, step in zip(members, members[1:], steps):
-        if by_number and not _next_number(before[0], after[0]):
-            follows = False
-        elif step is None or (by_number and abs(step) <= _TOLERANCE):  # copied without their times
-            follows = by_number
-        elif step > _MAX_SEGMENT and duration is None:
-            follows = False
-        elif usual is not None and abs(step - usual) <= _TOLERANCE:
-            follows = True
-        elif usual is not None and step > usual:
-            follows = False
-        else:  # a shorter segment may be the last one of its trip
-            segment = after if by_number else before
-            follows = duration is not None and abs(step - duration(segment[1])) <= _TOLERANCE
+    trips, gaps = [[members[0]]], [None]
+    unclear = None
+    for before, after in itertools.pairwise(members):
+        gap = _find_gap(before, after, duration)
+        by_number = before[0].number is not None and after[0].number == before[0].number + 1
+        follows = gap is not None and abs(gap) <= _TOLERANCE
+        if before[0].start is None:
+            # No camera writes two files at once: earlier times are those of a copy.
+            copied = gap is None or gap < -_TOLERANCE
+            follows = by_number and (follows or copied or before[0].chapter)
+            if follows and copied and not before[0].chapter:
+                unclear = unclear or after[1]
         if follows:
             trips[-1].append(after)
         else:
             trips.append([after])
-    return [Trip(tuple(file for _, file in trip), trip[0][0].camera, trip[0][0].start) for trip in trips]
+            gaps.append(gap)
+    if unclear is not None:
+        _LOGGER.warning(
+            "%s and others follow each other by their numbers only, because their modification times are not "
+            "those of the camera: gaps are not noticed; copy the card with its times (cp -p)",
+            unclear,
+        )
+    return [
+        Trip(tuple(file for _, file in trip), trip[0][0].camera, trip[0][0].start, gap)
+        for trip, gap in zip(trips, gaps, strict=True)
+    ]
 
 
-def _step(before: _Segment, after: _Segment) -> float | None:
-    """Seconds between the starts of two segments, or between their ends, if known."""
-    if before.start is not None and after.start is not None:
-        return (after.start - before.start).total_seconds()
-    if before.end is not None and after.end is not None:
-        return after.end - before.end
-    return None
+def _find_gap(
+    before: tuple[_Segment, File], after: tuple[_Segment, File], duration: Callable[[File], float]
+) -> float | None:
+    """Seconds from the end of a segment to the start of the next one, if known."""
+    (first, first_file), (second, second_file) = before, after
+    if first.start is not None and second.start is not None:
+        length = duration(first_file)
+        return (second.start - first.start).total_seconds() - length if length > 0 else None
+    if first.chapter or first.end is None or second.end is None:
+        return None
+    step = second.end - first.end
+    if step <= _TOLERANCE:  # copied without their times, or in another order
+        return None
+    length = duration(second_file)
+    # A last file that cannot be read may have any length.
+    return step - length if length > 0 else max(step - _MAX_SEGMENT, 0.0)
 
 
 def _modification_time(file: Path) -> float | None:
@@ -250,18 +326,3 @@ def _modification_time(file: Path) -> float | None:
         return file.stat().st_mtime
     except OSError:
         return None
-
-
-def _usual_step(steps: Sequence[float]) -> float | None:
-    """Length of the camera's segments, if two steps agree on it: the most frequent step between starts."""
-    counts = Counter(round(step) for step in steps if 0 < step <= _MAX_SEGMENT)
-    agreeing = {
-        step: sum(counts[step + offset] for offset in (-1, 0, 1)) * 10 + count
-        for step, count in counts.items()
-    }
-    best = max(agreeing, key=lambda step: (agreeing[step], step), default=None)
-    return float(best) if best is not None and agreeing[best] >= 20 else None
-
-
-def _next_number(before: _Segment, after: _Segment) -> bool:
-    return before.number is not None and after.number == before.number + 1

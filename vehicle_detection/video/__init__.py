@@ -4,16 +4,10 @@ from vehicle_detection.video.clips import annotate_clip
 from vehicle_detection.video.engine import TrackRun, VideoDetector, VideoReport, track
 from vehicle_detection.video.files import is_video_file, list_files, walk_files
 from vehicle_detection.video.horizon import estimate_video_horizon
+from vehicle_detection.video.opening import Source, borrow_source, open_source, probe_video, read_frames
 from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.remote import download, open_filesystem, with_retries
-from vehicle_detection.video.sources import (
-    FrameSource,
-    Source,
-    borrow_source,
-    open_source,
-    probe_video,
-    read_frames,
-)
+from vehicle_detection.video.sources import FrameSource
 from vehicle_detection.video.viewer import Viewer, open_viewer
 from vehicle_detection.video.writing import PRESETS, check_video_target, cut_video, process_video, write_video
 

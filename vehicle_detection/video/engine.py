@@ -42,9 +42,10 @@ from vehicle_detection.tracking import (
     search_delay,
     search_interval,
 )
+from vehicle_detection.video.opening import Source, borrow_source
 from vehicle_detection.video.queues import ClosableQueue, QueueClosed
 from vehicle_detection.video.reading import AudioSource, Reader, check_span, frame_range
-from vehicle_detection.video.sources import FrameSource, Source, borrow_source
+from vehicle_detection.video.sources import FrameSource
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -382,7 +383,7 @@ class TrackRun(Closing):
             stages=dict(stages),
             tracks=len(self._track_ids),
             dropped=self._pipeline.dropped,
-            damage=self._pipeline.damage,
+            damage="; ".join(filter(None, (self._pipeline.damage, self.source.find_change()))),
         )
 
     def stop(self) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
+import math
 import os
 import re
+import select
 import shutil
 import signal
 import subprocess
@@ -38,9 +40,13 @@ _LIMITS = {errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE}
 _RAISE_LIMITS = "close other programs, or raise the limits of this process (ulimit), and try again"
 # Messages of ffmpeg about threads or open files that the system refuses.
 _SYSTEM_FAULT = re.compile(r"^.*(Resource temporarily unavailable|Too many open files).*$", re.MULTILINE)
+# Lines that follow the messages about errors.
+_STATISTICS = re.compile(r"Conversion failed!|frame= |video:|Nothing was written")
 _NO_MEMORY = "Cannot allocate memory"
 NETWORK_TIMEOUT = 10.0
 """Seconds without data after which a server has failed."""
+NETWORK_DEADLINE = 60.0
+"""Seconds after which a server has failed that sends too little for a frame, or for the start of a video."""
 
 
 def input_options(path: Path | str) -> tuple[str, ...]:
@@ -224,10 +230,17 @@ class Process:
         for pipe in (self.stdin, self.stdout):
             _enlarge(pipe)
 
-    def wait(self) -> int:
-        """Wait until the process has ended and return its exit code."""
+    def wait(self, timeout: float = math.inf) -> int:
+        """Wait until the process has ended, or kill it after some seconds, and return its exit code.
+
+        The code is 0 where SIGCHLD is ignored and the system keeps no code, so outputs need a check.
+        """
         if sys.platform == "win32":
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                return self._popen.wait(None if math.isinf(timeout) else timeout)
+            self.kill()
             return self._popen.wait()
+        end = time.monotonic() + timeout
         # wait4 reports the processor time. It must not block while it holds the lock that `kill` needs.
         while True:
             with self._lock:
@@ -235,12 +248,14 @@ class Process:
                     self._poll()
                 if self._popen.returncode is not None:
                     return self._popen.returncode
+            if time.monotonic() > end:
+                self.kill()
             time.sleep(0.002)
 
     def _poll(self) -> None:
         try:
             pid, status, usage = os.wait4(self._popen.pid, os.WNOHANG)
-        except ChildProcessError:  # SIGCHLD is ignored, as under some supervisors: the code is unknown
+        except ChildProcessError:  # SIGCHLD is ignored, as under some supervisors
             self._popen.returncode = 0
             return
         if pid:
@@ -256,6 +271,14 @@ class Process:
                 return False
             done += size
         return True
+
+    def has_data(self, timeout: float) -> bool:
+        """Wait some seconds for output, or for its end; on Windows, where pipes cannot be polled, do not."""
+        if sys.platform == "win32":
+            return True
+        poll = select.poll()
+        poll.register(self.stdout, select.POLLIN)
+        return bool(poll.poll(timeout * 1000))
 
     def kill(self) -> None:
         """End the process at once; threads that read from it or write to it stop waiting."""
@@ -289,10 +312,21 @@ def _enlarge(pipe: IO[bytes] | None) -> None:
 
 def run_ffmpeg(path: Path | str, options: Sequence[str], *, level: str) -> tuple[int, str]:
     """Run ffmpeg on a file or URL to its end, and return its exit code and its log."""
+    timeout = math.inf if isinstance(path, Path) else NETWORK_DEADLINE
     with contextlib.closing(Process(options, level=level)) as process:
-        code, log = process.wait(), process.log()
+        begun = time.monotonic()
+        code, log = process.wait(timeout), process.log()
+        if time.monotonic() - begun > timeout:
+            raise too_slow(source_name(path))
     check_resources(source_name(path), code, log)
     return code, log
+
+
+def too_slow(name: str) -> TransientVideoError:
+    """Return the error of a server that sends, but too little."""
+    return TransientVideoError(
+        f"{name} sends too little data for a frame within {NETWORK_DEADLINE:g} s; check the connection"
+    )
 
 
 def exit_reason(code: int, log: str) -> str:
@@ -320,9 +354,7 @@ def video_error(message: str, source: Path | str, code: int, log: str) -> VideoE
 def last_line(log: str) -> str:
     """Last message of ffmpeg's log, without the prefix ``[component @ address]``."""
     lines = [re.sub(r"^(\[[^\]]*\] *)+", "", line).strip() for line in log.splitlines()]
-    return next(
-        (line for line in reversed(lines) if line and line != "Conversion failed!"), "no reason given"
-    )
+    return next((line for line in reversed(lines) if line and not _STATISTICS.match(line)), "no reason given")
 
 
 def seconds_of(time: str) -> float:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tracking import HorizonEstimate, estimate_horizon
+from vehicle_detection.video.opening import Source, borrow_source
 from vehicle_detection.video.reading import check_span, frame_range
-from vehicle_detection.video.sources import Source, borrow_source
 
 _MAX_STD = 0.05  # as a fraction of the frame's height
 # Seconds between searched frames, their number at least (in a short video) and at most, and the number of

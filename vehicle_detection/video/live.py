@@ -6,9 +6,7 @@ import contextlib
 import logging
 import math
 import re
-import select
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -64,8 +62,11 @@ class _LiveProcess:
         if like is not None:
             filters = f"scale={like.width}:{like.height}:out_color_matrix=bt601:out_range=tv"
             rate = ("-r", str(like.fps))
-        output = ("-map", "0:V:0", "-vf", filters, *rate, "-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe")
-        self.process = Process((*pixel_limit(), *options, *output, "pipe:1"), stdin=stdin, stdout=True)
+        output = ("-an", "-vf", filters, *rate, "-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe", "pipe:1")
+        # Level "info": its log states the format of the input.
+        self.process = Process(
+            ("-nostats", *pixel_limit(), *options, *output), level="info", stdin=stdin, stdout=True
+        )
 
     def read_info(self) -> VideoInfo:
         """Read the header of the stream."""
@@ -87,8 +88,14 @@ class _LiveProcess:
             message = f"{self.name} is not a video that ffmpeg can read ({reason}); {remedy}"
             raise video_error(message, self.name, code, log)
         width, height, numerator, denominator = (int(number) for number in size.groups())
+        found = re.search(r"^Input #0, (\S+),", self.process.log(), re.MULTILINE)
         return VideoInfo(
-            width=width, height=height, fps=Fraction(numerator, denominator or 1), frames=0, duration=0.0
+            width=width,
+            height=height,
+            fps=Fraction(numerator, denominator or 1),
+            frames=0,
+            duration=0.0,
+            container=found[1] if found else "",
         )
 
     def read_planes(self, planes: NDArray[np.uint8]) -> bool:
@@ -109,11 +116,7 @@ class _LiveProcess:
 
     def _has_data(self, timeout: float) -> bool:
         """Wait for data or the end of the pipe."""
-        if not self._timed or sys.platform == "win32":  # where pipes cannot be polled
-            return True
-        poll = select.poll()
-        poll.register(self.process.stdout, select.POLLIN)
-        self._stalled = not poll.poll(timeout * 1000)
+        self._stalled = self._timed and not self.process.has_data(timeout)
         return not self._stalled
 
 

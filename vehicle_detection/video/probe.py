@@ -11,7 +11,7 @@ import itertools
 import re
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -39,6 +39,21 @@ _STREAM_START = r", start (-?[\d.]+)"
 _FIRST_FRAME = r"n: *0 .*?pts_time:(\S+).*? s:(\d+)x(\d+)"
 # Containers whose duration counts from time 0 instead of from the file's start.
 _DURATION_IS_END = ("matroska,webm", "flv")
+# Demuxers of streams without a container, besides those whose names end in "_pipe".
+_RAW = {
+    "h264",
+    "hevc",
+    "vvc",
+    "mjpeg",
+    "m4v",
+    "mpegvideo",
+    "h263",
+    "h261",
+    "cavsvideo",
+    "dirac",
+    "vc1",
+    "obu",
+}
 # Rate in Hz above which a rate may be that of a clock, or of frames that arrive in bursts.
 _MAX_RATE = 60
 # Length of the beginning of a remote file whose times are read.
@@ -94,6 +109,9 @@ class VideoInfo:
     audio_track: int | None = None
     audio_codec: str | None = None
     audio_format: tuple[str, ...] = ()  # stream number, codec, rate and channels, as ffmpeg prints them
+    stream: int = 0  # ffmpeg's number of the video stream
+    other_streams: str = ""  # the other video streams, such as "0 (320x180)"
+    rate_stated: bool = True  # whether the file states its frame rate
 
     @property
     def has_audio(self) -> bool:
@@ -101,25 +119,38 @@ class VideoInfo:
         return self.audio_track is not None
 
     @property
+    def is_raw(self) -> bool:
+        """Whether it has no container, and therefore no times, such as a file of H.264."""
+        return self.container in _RAW or self.container.endswith("_pipe")
+
+    @property
     def shape(self) -> tuple[int, int, int]:
         """Shape of a frame: ``(height, width, 3)``."""
         return (self.height, self.width, 3)
 
 
-def probe(path: Path | str) -> VideoInfo:
-    """Read the properties of a video and decode its first frame; raise a VideoError if there is none."""
+def probe(path: Path | str, stream: int | None = None) -> VideoInfo:
+    """Read the properties of a video and decode its first frame; raise a VideoError if there is none.
+
+    `stream` is ffmpeg's number of the video stream; None: that which is marked as the default, else the
+    largest one, of those with more than one frame.
+    """
     # Python raises KeyboardInterrupt in the main thread only; another thread cannot lose the started process.
-    return call_in_thread(lambda: _probe(path))
+    return call_in_thread(lambda: _probe(path, stream))
 
 
-def _probe(path: Path | str) -> VideoInfo:
-    header, decoded, container = _read_log(path)
+def _probe(path: Path | str, chosen: int | None) -> VideoInfo:
+    header, decoded, container = _read_log(path, "0:V:0" if chosen is None else f"0:{chosen}")
+    index, streams = int(_find(r"Stream #0:(\d+)", decoded, "0")), _video_streams(header)
+    if chosen is None and len(streams) > 1:
+        best = next((each for each in streams if _has_frames(path, each)), index)
+        if best != index:
+            index, (header, decoded, container) = best, _read_log(path, f"0:{best}")
     moment, width, height = _find_all(_FIRST_FRAME, decoded)
-    index = int(_find(r"Stream #0:(\d+)", decoded, "0"))
     stream = _find(rf"^(  Stream #0:{index}\b[\s\S]*?)(?=^  Stream #|\Z)", header, "")
     fps, constant = frame_rate(decoded, stream)
     if container == "matroska,webm":  # its header may state a wrong rate
-        fps, constant = _rate_of_times(fps, _frame_times(path))
+        fps, constant = _rate_of_times(fps, _frame_times(path, index))
     begin = float(_find(r"^  Duration: .*?, start: (-?[\d.]+)", header, "0"))
     duration = seconds_of(_find(r"^  Duration: ([\d:.]+)", header, "0:0:0"))
     if container in _DURATION_IS_END:
@@ -137,7 +168,7 @@ def _probe(path: Path | str) -> VideoInfo:
     length = duration if container == "avi" else max(duration - start_time, 0.0)
     sound = _find_all(r", (\d+) Hz, ([^,]+)", audio_text)
     colors = _find_all(r"color_range:(\w+) color_space:(\w+)", decoded)
-    return VideoInfo(
+    info = VideoInfo(
         width=int(width),
         height=int(height),
         fps=fps,
@@ -155,18 +186,52 @@ def _probe(path: Path | str) -> VideoInfo:
         audio_track=track,
         audio_codec=audio_codec,
         audio_format=() if audio_codec is None else (audio_index, audio_codec, *sound),
+        stream=index,
+        other_streams=", ".join(f"{each} ({size})" for each, size in streams.items() if each != index),
     )
+    return _rate_of_raw(path, info) if info.is_raw else info
 
 
-def _read_log(path: Path | str) -> tuple[str, str, str]:
-    """Decode the first frame of a video, with square pixels; raise a VideoError if there is none.
+def _video_streams(header: str) -> dict[int, str]:
+    """Return numbers and sizes of the video streams, without covers: default ones first, then large ones."""
+    lines = re.findall(r"^  Stream #0:(\d+).*: Video: .*?, (\d+)x(\d+)(.*)", header, re.MULTILINE)
+    found = [line for line in lines if "(attached pic)" not in line[3]]
+    found.sort(key=lambda line: ("(default)" not in line[3], -int(line[1]) * int(line[2])))
+    return {int(number): f"{width}x{height}" for number, width, height, _ in found}
+
+
+def _has_frames(path: Path | str, stream: int) -> bool:
+    """Whether a stream has more than one frame."""
+    options = (*input_options(path), "-map", f"0:{stream}", "-c", "copy", "-frames:v", "2", "-f", "null", "-")
+    return count_frames(run_ffmpeg(path, options, level="info")[1]) > 1
+
+
+def _rate_of_raw(path: Path | str, info: VideoInfo) -> VideoInfo:
+    """Return the properties of a raw stream with its frame rate, or 25 if it states none.
+
+    ffmpeg gives the frames of a stream without a rate that of an option, here a rate that no stream has.
+    """
+    _, decoded, _ = _read_log(path, f"0:{info.stream}", ("-framerate", "17"))
+    length = float(_find(r"n: *0 .*?duration_time:(\d[\d.]*)", decoded, "0"))
+    stated = length > 0 and abs(17 * length - 1) > 1e-4
+    rate = Fraction(1 / length).limit_denominator(1001) if stated else Fraction(25)
+    return replace(info, fps=rate, constant_rate=True, rate_stated=stated)
+
+
+def count_frames(log: str) -> int:
+    """Return the number of frames by ffmpeg's statistics."""
+    return int(re.findall(r"frame= *(\d+)", log)[-1]) if "frame=" in log else 0
+
+
+def _read_log(path: Path | str, stream: str, demuxer: tuple[str, ...] = ()) -> tuple[str, str, str]:
+    """Decode the first frame of a stream, with square pixels; raise a VideoError if there is none.
 
     Returns ffmpeg's log about the file, the log about the filters and the frame, and the container's names.
     """
     # "V" excludes cover pictures. Only the showinfo filter prints the exact frame rate.
-    options = ("-map", "0:V:0", "-frames:v", "1", "-vf", f"{SQUARE_PIXELS},showinfo", "-f", "null", "-")
+    options = ("-map", stream, "-frames:v", "1", "-vf", f"{SQUARE_PIXELS},showinfo", "-f", "null", "-")
     name = source_name(path)
-    code, log = run_ffmpeg(path, (*pixel_limit(), *input_options(path), *options), level="info")
+    code, log = run_ffmpeg(path, (*pixel_limit(), *demuxer, *input_options(path), *options), level="info")
     if code < 0:
         raise video_error(f"{name} cannot be read: {exit_reason(code, log)}", path, code, log)
     check_frame_size(name, log)
@@ -180,9 +245,15 @@ def _read_log(path: Path | str) -> tuple[str, str, str]:
         message = f"{name} is not a video that ffmpeg can read ({reason}); record or copy it again"
         raise video_error(message, path, code, log)
     if not mapped:
-        raise VideoError(f"{name} has no video track; choose a file with one")
+        known = _video_streams(header)
+        raise VideoError(
+            f"{name} has the video streams {', '.join(map(str, known))}, not {stream[2:]}; choose one of them"
+            if known
+            else f"{name} has no video track; choose a file with one"
+        )
     if not _find_all(_FIRST_FRAME, decoded):
-        message = f"{name} has no frame that can be decoded ({last_line(log)}); copy it again"
+        reason = "it is incomplete" if "partial file" in log else last_line(log)
+        message = f"{name} has no frame that can be decoded ({reason}); copy it again"
         raise video_error(message, path, code, log)
     return header, decoded, container
 
@@ -222,10 +293,10 @@ def frame_rate(decoded: str, stream: str) -> tuple[Fraction, bool]:
     return (rate if constant else _resampling_rate(rate, mean)), constant
 
 
-def _frame_times(path: Path | str) -> list[float]:
+def _frame_times(path: Path | str, stream: int) -> list[float]:
     """List the times of all frames in seconds, without decoding them; of a URL those of its beginning."""
     limit = () if isinstance(path, Path) else ("-t", _REMOTE_SECONDS)
-    options = (*limit, *input_options(path), "-map", "0:V:0", "-c", "copy")
+    options = (*limit, *input_options(path), "-map", f"0:{stream}", "-c", "copy")
     options += ("-f", "framecrc", "pipe:1")
     with contextlib.closing(Process(options, stdout=True)) as process:
         listing = process.stdout.read().decode()

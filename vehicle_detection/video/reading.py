@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import Closing, check_number, pluralize
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.video.ffmpeg import (
+    NETWORK_DEADLINE,
     Process,
     check_resources,
     exit_reason,
@@ -30,6 +31,7 @@ from vehicle_detection.video.ffmpeg import (
     run_ffmpeg,
     seconds_of,
     source_name,
+    too_slow,
     video_error,
 )
 from vehicle_detection.video.probe import VideoInfo
@@ -117,8 +119,9 @@ class FrameReader(Reader):
             filters = [f"trim=start={begin}", *filters]
         options = ["-ss", f"{seek:.6f}"] if seek > info.video_offset else []
         self._sought = bool(options)
+        options += ["-r", str(info.fps)] if info.is_raw else []
         options += ["-threads", _DECODER_THREADS, *pixel_limit(), *input_options(path)]
-        options += ["-map", "0:V:0", "-vf", ",".join(filters)]
+        options += ["-map", f"0:{info.stream}", "-vf", ",".join(filters)]
         if count is not None:
             options += ["-frames:v", str(count)]
         options += ["-fps_mode", "passthrough"]
@@ -135,7 +138,7 @@ class FrameReader(Reader):
     def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
         if self._process.stdout.closed:
             raise StopIteration
-        if not self._process.read_into(self._buffer):
+        if not self._process.read_into(self._buffer, self._has_data):
             self._finish()
             raise StopIteration
         if self._in_planes:
@@ -145,6 +148,13 @@ class FrameReader(Reader):
         index = self._first + self.frames_read
         self.frames_read += 1
         return index, float(index / self.info.fps), frame
+
+    def _has_data(self) -> bool:
+        """Whether a file, or a server in time, has something for the next frame."""
+        if isinstance(self._path, Path) or self._process.has_data(NETWORK_DEADLINE):
+            return True
+        self.close()
+        raise too_slow(source_name(self._path))
 
     def _finish(self) -> None:
         """Close ffmpeg after its last frame; raise an error if frames are missing."""
@@ -215,17 +225,17 @@ def find_seek_time(path: Path | str, info: VideoInfo, wanted: float) -> float:
         seek = wanted - float(math.ceil(seconds * info.fps) / info.fps)
         if seek <= info.video_offset:
             break
-        if indexed or _first_time(path, seek) <= wanted - seek:
+        if indexed or _first_time(path, info.stream, seek) <= wanted - seek:
             return seek
     return info.video_offset
 
 
-def _first_time(path: Path | str, seek: float) -> float:
+def _first_time(path: Path | str, stream: int, seek: float) -> float:
     """Time of the first frame that is decoded after a seek, from there, in seconds.
 
     It is infinite if the frame is no key frame: some decoders begin with others, which are gray then.
     """
-    options = ("-noaccurate_seek", "-ss", f"{seek:.6f}", *input_options(path), "-map", "0:V:0")
+    options = ("-noaccurate_seek", "-ss", f"{seek:.6f}", *input_options(path), "-map", f"0:{stream}")
     options += ("-frames:v", "1", "-vf", "showinfo", "-f", "null", "-")
     _, log = run_ffmpeg(path, options, level="info")
     found = re.search(r"n: *0 .*?pts_time:(-?[\d.]+).*? iskey:1 ", log)
@@ -278,7 +288,7 @@ def _announced_frames(path: Path | str, info: VideoInfo, end: int, *, exact: boo
 
 def stream_duration(path: Path | str, info: VideoInfo) -> float | None:
     """Duration of the video stream in seconds; None if the file does not state it."""
-    options = (*input_options(path), "-map", "0:V:0", "-c", "copy", "-frames:v", "1")
+    options = (*input_options(path), "-map", f"0:{info.stream}", "-c", "copy", "-frames:v", "1")
     _, log = run_ffmpeg(path, (*options, "-f", "null", "-"), level="trace")
     mapped = re.search(r"Stream #0:(\d+) -> #0:0", log)
     index = mapped[1] if mapped else "0"

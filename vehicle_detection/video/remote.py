@@ -12,13 +12,14 @@ from urllib.parse import unquote
 
 from vehicle_detection._common import hide_credentials
 from vehicle_detection.errors import InvalidInputError, TransientVideoError
-from vehicle_detection.video.ffmpeg import NETWORK_TIMEOUT
+from vehicle_detection.video.ffmpeg import NETWORK_DEADLINE, NETWORK_TIMEOUT
 
 Result = TypeVar("Result")
 
 # Seconds before the second and the third attempt of a request.
 _RETRY_DELAYS = (0.2, 1.0)
 _CHUNK_BYTES = 1 << 20
+_MIN_RATE = 1000  # bytes per second below which a server has failed
 # Maximum length of a file name, in characters that may take four bytes each.
 _MAX_NAME = 60
 _FINAL_ERRORS = (FileNotFoundError, PermissionError, NotImplementedError, TypeError, AttributeError)
@@ -63,8 +64,14 @@ def _download_http(url: str, path: Path) -> None:
         if answer.status_code in (404, 410):
             raise FileNotFoundError(url)
         answer.raise_for_status()
+        begun, size = time.monotonic(), 0
+        read = getattr(answer.raw, "read1", answer.raw.read)  # urllib3 before 2.2 lacks it
         with path.open("wb") as file:
-            file.writelines(answer.iter_content(_CHUNK_BYTES))
+            while data := read(_CHUNK_BYTES, decode_content=True):
+                size += file.write(data)
+                elapsed = time.monotonic() - begun
+                if elapsed > NETWORK_DEADLINE and size < _MIN_RATE * elapsed:
+                    raise TimeoutError(f"only {size} bytes in {elapsed:.0f} s")
 
 
 def with_retries(request: Callable[[], Result]) -> Result:

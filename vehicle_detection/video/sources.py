@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import math
-import os
-import re
-import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -18,36 +16,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    Closing,
-    check_flags,
-    check_number,
-    check_path,
-    describe,
-    local_path,
-    temporary_folder,
-)
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection._common import Closing, temporary_folder
+from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.images import read_image
-from vehicle_detection.video.ffmpeg import NETWORK_TIMEOUT, input_options, source_name
-from vehicle_detection.video.files import IMAGE_SUFFIXES, check_file, is_video_file, list_files
+from vehicle_detection.video.ffmpeg import input_options, source_name
+from vehicle_detection.video.files import IMAGE_SUFFIXES
 from vehicle_detection.video.live import LiveStream
-from vehicle_detection.video.probe import VideoInfo, probe
-from vehicle_detection.video.reading import (
-    AudioSource,
-    FrameReader,
-    Reader,
-    check_span,
-    frame_range,
-    stream_duration,
-)
-from vehicle_detection.video.remote import download
+from vehicle_detection.video.probe import VideoInfo
+from vehicle_detection.video.reading import AudioSource, FrameReader, Reader, stream_duration
 
 _LOGGER = logging.getLogger(__name__)
 
-_URL = re.compile(r"^([a-zA-Z][a-zA-Z0-9+.-]+)://")
-_STREAM_SCHEMES = ("rtsp", "rtsps", "rtmp", "rtmps", "udp", "rtp", "srt", "tcp")
-_RTSP_OPTIONS = ("-rtsp_transport", "tcp", "-timeout", f"{NETWORK_TIMEOUT * 1e6:.0f}")
+USUAL_FPS = 25.0
+"""Frame rate that is assumed where none is stated."""
+NO_RATE = "%s states no frame rate: 25 is assumed, on which times and speeds depend; set it with fps or --fps"
+"""Warning of the assumed frame rate."""
 
 
 class FrameSource(Closing):
@@ -68,6 +51,8 @@ class FrameSource(Closing):
     def __init__(self, name: str, info: VideoInfo, files: Sequence[Path] = ()) -> None:
         self.name, self.info = name, info
         self.files = tuple(files)  # that are read, in order; empty for streams
+        self.segment_starts: tuple[float, ...] = (0.0,)  # of the files of a trip, in seconds of the video
+        self._states = {path: _state(path) for path in self.files if path.suffix not in IMAGE_SUFFIXES}
         self._on_close = contextlib.ExitStack()
 
     def __repr__(self) -> str:
@@ -87,6 +72,14 @@ class FrameSource(Closing):
     def _audio(self, first: int, length: float | None) -> AudioSource | None:
         return None
 
+    def find_change(self) -> str:
+        """Say which video file was replaced or truncated since the source was opened; empty if none."""
+        for path, (inode, size) in self._states.items():
+            now = _state(path)
+            if now[0] != inode or now[1] < size:
+                return f"{path} was replaced or truncated while it was read; process it again"
+        return ""
+
     def __iter__(self) -> Iterator[tuple[int, float, NDArray[np.uint8]]]:
         with self.read() as reader:
             yield from reader
@@ -96,7 +89,16 @@ class FrameSource(Closing):
         self._on_close.close()
 
 
-class _VideoFile(FrameSource):
+def _state(path: Path) -> tuple[int, int]:
+    """Identity and size of a file; that of a recording may grow."""
+    try:
+        status = path.stat()
+    except OSError:
+        return -1, -1
+    return status.st_ino, status.st_size
+
+
+class VideoFile(FrameSource):
     """A video file, or the URL of one."""
 
     def __init__(self, path: Path | str, info: VideoInfo) -> None:
@@ -104,6 +106,7 @@ class _VideoFile(FrameSource):
         self._path = path
 
     def read(self, first: int = 0, count: int | None = None) -> FrameReader:
+        """Open a reader of the file."""
         return FrameReader(self._path, self.info, first=first, count=count, strict=self.strict)
 
     def _audio(self, first: int, length: float | None) -> AudioSource:
@@ -116,18 +119,26 @@ class _VideoFile(FrameSource):
         )
 
 
-class _ImageSequence(FrameSource):
+def exact_rate(fps: float) -> Fraction:
+    """Return a frame rate as the fraction that it is meant to be, such as 30000/1001."""
+    return Fraction(fps).limit_denominator(1001) if fps > 1 else 1 / Fraction(1 / fps).limit_denominator(1001)
+
+
+class ImageSequence(FrameSource):
     """Image files as the frames of a video."""
 
-    def __init__(self, paths: Sequence[Path], fps: float) -> None:
+    def __init__(self, paths: Sequence[Path], fps: float | None) -> None:
         height, width = read_image(paths[0]).shape[:2]
-        exact = Fraction(fps)
-        rate = exact.limit_denominator(1001) if fps > 1 else 1 / Fraction(1 / fps).limit_denominator(1001)
+        if fps is None and len(paths) > 1:
+            _LOGGER.warning(NO_RATE, paths[0].parent)
+        fps = USUAL_FPS if fps is None else fps
+        rate = exact_rate(fps)
         duration = float(len(paths) / rate)
         info = VideoInfo(width=width, height=height, fps=rate, frames=len(paths), duration=duration)
         super().__init__(f"{paths[0]} to {paths[-1].name}", info, paths)
 
     def read(self, first: int = 0, count: int | None = None) -> Reader:
+        """Open a reader of the images."""
         return _ImageReader(self.info, self.files, first, count)
 
 
@@ -152,11 +163,23 @@ class _ImageReader(Reader):
         self._files = iter(())
 
 
-class _VideoSegments(FrameSource):
-    """Consecutive video files as one video, with the frame size and rate of the first one."""
+class VideoSegments(FrameSource):
+    """Consecutive video files as one video, with the frame size and rate of the first one.
 
-    def __init__(self, paths: Sequence[Path]) -> None:
-        infos = [probe(path) for path in paths]
+    A last one that cannot be read, as after a loss of power, is left out unless `strict`.
+    """
+
+    def __init__(
+        self, paths: Sequence[Path], probe: Callable[[Path], VideoInfo], *, strict: bool = False
+    ) -> None:
+        infos = [probe(path) for path in paths[:-1]]
+        self.lost = ""
+        try:
+            infos.append(probe(paths[-1]))
+        except VideoError as error:
+            if strict or isinstance(error, TransientVideoError):
+                raise
+            self.lost, paths = f"the last segment is left out: {error}", paths[:-1]
         first = infos[0]
         # Sound may be longer than the frames, which would add up.
         lengths = [
@@ -181,11 +204,14 @@ class _VideoSegments(FrameSource):
         if not sound:
             whole = replace(whole, audio_track=None, audio_codec=None)
         super().__init__(f"{paths[0]} to {paths[-1].name}", whole, paths)
+        self.segment_starts = tuple(itertools.accumulate(lengths[:-1], initial=0.0))
 
     def read(self, first: int = 0, count: int | None = None) -> Reader:
+        """Open a reader of the segments."""
         return _SegmentReader(self, first, count)
 
     def audio(self, first: int = 0, end: float | None = None) -> AudioSource | None:
+        """Return the joined sound; None if not all segments have the same kind."""
         if self._sound_differs:
             _LOGGER.warning(
                 "the segments after %s have sound of another format, or none; the video has none",
@@ -215,7 +241,7 @@ class _VideoSegments(FrameSource):
 class _SegmentReader(Reader):
     """Reader of the frames of several files, one after the other."""
 
-    def __init__(self, source: _VideoSegments, first: int, count: int | None) -> None:
+    def __init__(self, source: VideoSegments, first: int, count: int | None) -> None:
         self.info, self._strict = source.info, source.strict
         self._segments = list(zip(source.files, source.infos, strict=True))
         self._index, self._end = first, math.inf if count is None else first + count
@@ -225,7 +251,7 @@ class _SegmentReader(Reader):
         # Lengths of skipped segments are known from their headers only, if at all.
         while len(self._segments) > 1 and first >= (self._segments[0][1].frames or math.inf):
             first -= self._segments.pop(0)[1].frames
-        self._first = first
+        self._first, self._lost = first, source.lost
 
     def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
         while self._index < self._end:
@@ -239,6 +265,9 @@ class _SegmentReader(Reader):
 
     def _open_next(self) -> FrameReader:
         with self._lock:
+            if self._lost and not self._killed and not self._segments:
+                _LOGGER.warning("%s", self._lost)
+                self.damage, self._lost = "; ".join(filter(None, (self.damage, self._lost))), ""
             if self._killed or not self._segments:
                 raise StopIteration
             path, info = self._segments.pop(0)
@@ -267,7 +296,7 @@ class _SegmentReader(Reader):
         self._close_reader()
 
 
-class _Stream(FrameSource):
+class Stream(FrameSource):
     """A stream that can be read once: standard input, a camera or a network stream."""
 
     rereadable = False
@@ -278,227 +307,8 @@ class _Stream(FrameSource):
         self._on_close.callback(stream.close)
 
     def read(self, first: int = 0, count: int | None = None) -> Reader:
+        """Start to read; once only."""
         if self._read:
             raise InvalidInputError(f"source {self.name} can be read only once; open it again")
         self._read = True
         return self._stream.start(drop=self.live, first=first, count=count)
-
-
-Source = str | os.PathLike[str] | int | Sequence[str | os.PathLike[str]] | FrameSource
-"""What `open_source` takes."""
-
-
-def open_source(
-    source: Source,
-    *,
-    fps: float = 25.0,
-    live: bool | None = None,
-    reconnect: bool = True,
-    strict: bool = False,
-) -> FrameSource:
-    """Open any source of frames.
-
-    Parameters
-    ----------
-    source
-        - a video file, or a named pipe; ``"-"``: a video on standard input;
-        - a list of files: consecutive videos, which become one, or images; `open_trip` finds the files of a
-          trip in a folder;
-        - a folder or a glob pattern with images, in the order of their names, or with one video;
-        - a camera: its number (``0`` or ``"0"``) or device (``"/dev/video0"``);
-        - a network stream: ``rtsp://``, ``rtmp://``, ``udp://``, ``srt://``, or ``http(s)://``, which may
-          also be a file;
-        - a file on storage that fsspec knows, such as ``"s3://bucket/drive.mp4"``, which is copied to a
-          temporary file (extra ``[batch]``).
-    fps
-        Frame rate of images.
-    live
-        Whether to drop frames that are not read in time, so that the newest frame is read next. None: for
-        cameras and network streams of unknown length. Otherwise, the sender has to wait.
-    reconnect
-        Whether to open a network stream of unknown length again when it ends or sends nothing for 10 seconds:
-        six attempts within about half a minute, which start over after 10 seconds of frames.
-    strict
-        Raise an error after the last frame if a file is damaged: frames are missing, or ffmpeg reports
-        decoding errors. Otherwise a warning is logged, and ``damage`` of the reader or of the report says it.
-        Streams are not checked.
-
-    Returns
-    -------
-    FrameSource
-        A context manager and an iterable of ``(index, time, frame)``. Dropped frames leave gaps in the
-        indices, and times stay right.
-
-    Examples
-    --------
-    >>> with open_source("test_images/*.jpg", fps=10) as source:
-    ...     for index, time, frame in source:
-    ...         if time >= 0.2:
-    ...             break
-    >>> index, frame.shape, source.info.frames
-    (2, (720, 1280, 3), 6)
-    """
-    if isinstance(source, FrameSource):
-        return source
-    check_flags(reconnect=reconnect, strict=strict)
-    opened = _open(source, check_number(fps, "fps", above=0, high=1000), live, reconnect)
-    opened.strict = strict
-    return opened
-
-
-def _open(source: object, fps: float, live: bool | None, reconnect: bool) -> FrameSource:
-    """Open a source that is not yet open."""
-    if isinstance(source, int) and not isinstance(source, bool):
-        source = str(source)
-    if isinstance(source, (list, tuple)):
-        return _open_files([check_file(path) for path in source], fps)
-    if not isinstance(source, (str, os.PathLike)):
-        raise InvalidInputError(
-            f"source must be the path of a video file, a folder, a pattern, a list of files, a URL, '-' or a "
-            f"camera's number, got {describe(source)}; pass a file name, or call detector.process(frame, "
-            "time) with frames of your own"
-        )
-    text = os.fsdecode(source)
-    if text == "-":
-        return _open_stdin(bool(live))
-    if scheme := _URL.match(text):
-        return _open_url(text, scheme[1].lower(), fps, live, reconnect)
-    path = check_path(text, "source", kind="the path of a video file")
-    if (text.isdecimal() and not path.exists()) or text.startswith("/dev/video"):
-        return _open_camera(text, live is not False)
-    if path.is_fifo():
-        return _Stream(LiveStream(text, input_options(path)), live=bool(live))
-    files = list_files(path) or [check_file(path)]
-    if len(files) > 1 and is_video_file(files[0]):
-        raise InvalidInputError(
-            f"source {path} holds {len(files)} videos; open the segments of one trip with open_trip, or pass "
-            "a list of consecutive files"
-        )
-    return _open_files(files, fps)
-
-
-@contextlib.contextmanager
-def borrow_source(source: Source) -> Iterator[FrameSource]:
-    """Open a source for a block; one that the caller has opened stays open."""
-    if isinstance(source, FrameSource):
-        yield source
-        return
-    with open_source(source) as opened:
-        yield opened
-
-
-def _open_files(files: Sequence[Path], fps: float) -> FrameSource:
-    """Open one file, the segments of a trip or images."""
-    if not files:
-        raise InvalidInputError("source must name at least one file, got an empty list; add a file")
-    images = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
-    if len(images) == len(files):
-        return _ImageSequence(files, fps)
-    if images:
-        raise InvalidInputError(
-            f"source must be videos or images, got both ({files[0]}, {images[0]}); select one kind"
-        )
-    if len(files) == 1:
-        return _VideoFile(files[0], probe(files[0]))
-    broken = next((path for path in files if "\n" in str(path) or "\r" in str(path)), None)
-    if broken is not None:  # the list of files for ffmpeg has a line for each
-        raise InvalidInputError(f"source {str(broken)!r} has a line break in its name; rename the file")
-    return _VideoSegments(files)
-
-
-def _open_stdin(live: bool) -> FrameSource:
-    try:
-        descriptor = sys.stdin.fileno()
-    except (AttributeError, OSError, ValueError):
-        descriptor = -1
-    if descriptor < 0 or os.isatty(descriptor):
-        raise InvalidInputError(
-            "source - reads a video from standard input, which is not a pipe; use: cat drive.mp4 | ..."
-        )
-    return _Stream(LiveStream("-", ("-i", "pipe:0"), stdin=descriptor), live=live)
-
-
-def _open_camera(name: str, live: bool) -> FrameSource:
-    if sys.platform == "darwin":
-        options = ("-f", "avfoundation", "-framerate", "30", "-i", name)
-        return _Stream(LiveStream(name, options), live=live)
-    if sys.platform == "win32":
-        raise InvalidInputError(
-            f"source {name}: cameras are not supported on Windows; pipe the output of ffmpeg -f dshow to '-'"
-        )
-    device = f"/dev/video{name}" if name.isdecimal() else name
-    if not Path(device).exists():
-        raise InvalidInputError(f"source {name}: there is no camera {device}; see ls /dev/video*")
-    return _Stream(LiveStream(name, ("-f", "v4l2", "-i", device)), live=live)
-
-
-def _open_url(url: str, scheme: str, fps: float, live: bool | None, reconnect: bool) -> FrameSource:
-    if scheme == "file":
-        return _open(local_path(url), fps, live, reconnect)
-    if scheme in ("http", "https"):
-        info = None if live else probe(url)
-        if info is not None and info.duration:
-            return _VideoFile(url, info)
-    elif scheme not in _STREAM_SCHEMES:
-        return _download(url)
-    options = (*(_RTSP_OPTIONS if scheme.startswith("rtsp") else ()), "-i", url)
-    stream = LiveStream(source_name(url), options, network=True, reconnect=reconnect)
-    return _Stream(stream, live=live is not False)
-
-
-def _download(url: str) -> FrameSource:
-    """Copy a file of other storage to a temporary one, because a video is read at several places."""
-    with contextlib.ExitStack() as on_error:
-        folder = on_error.enter_context(temporary_folder(Path(tempfile.gettempdir()), "vehicle-source"))
-        path = download(url, folder)
-        source = _VideoFile(path, probe(path))
-        source.name = source_name(url)
-        source._on_close = on_error.pop_all()
-    return source
-
-
-def probe_video(path: str | os.PathLike[str]) -> VideoInfo:
-    """Read the properties of a video file: frame size, exact frame rate, length, sound and rotation.
-
-    >>> probe_video("missing.mp4")
-    Traceback (most recent call last):
-    ...
-    vehicle_detection.errors.InvalidInputError: source missing.mp4 does not exist; check the path
-    """
-    return probe(check_file(path))
-
-
-def read_frames(
-    source: str | os.PathLike[str],
-    *,
-    start: float | None = None,
-    end: float | None = None,
-    strict: bool = False,
-) -> FrameReader:
-    """Read the frames of a video file, one at a time; for other sources see `open_source`.
-
-    Parameters
-    ----------
-    source
-        A file that ffmpeg can read.
-    start, end
-        Time range in seconds: frames with ``start <= time < end`` are read. None: no limit.
-    strict
-        Raise an error after the last frame if the file is damaged, as in `open_source`.
-
-    Returns
-    -------
-    FrameReader
-        An iterator of ``(index, time, frame)``: the frame's number in the file from 0, its time in seconds,
-        and an upright ``(H, W, 3)`` uint8 RGB array. Its ``info`` is the file's `VideoInfo`. ffmpeg ends
-        after the last frame, and at the end of a ``with`` block.
-
-    Examples
-    --------
-    >>> with read_frames("drive.mp4", end=2.0) as frames:  # doctest: +SKIP
-    ...     means = [frame.mean() for index, time, frame in frames]
-    """
-    path = check_file(source)
-    info = probe(path)
-    first, count = frame_range(info, *check_span(start, end))
-    return FrameReader(path, info, first=first, count=count, strict=strict)

@@ -32,11 +32,12 @@ from vehicle_detection._common import (
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.tracking import FrameResult
 from vehicle_detection.video.engine import TrackRun, VideoDetector, VideoReport, track
-from vehicle_detection.video.ffmpeg import Process, exit_reason
-from vehicle_detection.video.probe import VideoInfo
+from vehicle_detection.video.ffmpeg import Process, exit_reason, run_ffmpeg
+from vehicle_detection.video.opening import Source, borrow_source
+from vehicle_detection.video.probe import VideoInfo, count_frames
 from vehicle_detection.video.queues import ClosableQueue, QueueClosed
 from vehicle_detection.video.reading import AudioSource, check_span, frame_range
-from vehicle_detection.video.sources import Source, borrow_source
+from vehicle_detection.video.sources import FrameSource
 from vehicle_detection.video.viewer import open_viewer
 from vehicle_detection.video.yuv import planes_from_rgb
 
@@ -125,8 +126,7 @@ class FrameWriter(Closing):
         if not self.frames_written:
             raise VideoError("no frame was read, so no video was written")
         self._process.stdin.close()
-        if self._process.wait():
-            raise self._error()
+        self._check(self._path)
         if trim_sound and self._has_sound:
             self._trim_sound()
 
@@ -139,10 +139,24 @@ class FrameWriter(Closing):
             options = [*whole, "-t", f"{seconds:.6f}", *whole, "-map", "0:v:0", "-map", "1:a:0"]
             self.close()
             self._process = Process([*options, "-c", "copy", *self._muxer, f"file:{trimmed}"])
-            if self._process.wait():
-                raise self._error()
+            self._check(trimmed)
             # Not renamed: other processes recognize a file in use by its lock.
             shutil.copyfile(trimmed, self._path)
+
+    def _check(self, path: Path) -> None:
+        """Wait for the end of ffmpeg, and count the frames of its file; an error if some are missing."""
+        code = self._process.wait()
+        options = ("-i", f"file:{path}", "-map", "0:v:0", "-c", "copy", "-f", "null", "-")
+        if code:
+            raise self._error()
+        frames = count_frames(run_ffmpeg(path, options, level="info")[1])
+        if frames != self.frames_written:
+            known = self._process.log().strip()
+            reason = f" ({exit_reason(code, known)})" if known else ""
+            raise TransientVideoError(
+                f"{self._name} cannot be written: ffmpeg wrote {frames} of {self.frames_written} frames"
+                f"{reason}; check ffmpeg and the disk; nothing of it was kept"
+            )
 
     def _error(self) -> TransientVideoError:
         reason = exit_reason(self._process.wait(), self._process.log())
@@ -208,6 +222,7 @@ def write_video(
     """
     with contextlib.ExitStack() as stack:
         stack.enter_context(results)
+        stack.enter_context(_name_changed_source(results.source))
         check_flags(audio=audio, show=show)
         if on_result is not None and not callable(on_result):
             raise InvalidInputError(f"on_result must be a function of a result, got {describe(on_result)}")
@@ -372,6 +387,18 @@ class _Sink(Closing):
 
 
 @contextlib.contextmanager
+def _name_changed_source(source: FrameSource) -> Iterator[None]:
+    """Name a source that changes while it is read as the cause of an error, in place of the output."""
+    try:
+        yield
+    except VideoError as error:
+        change = source.find_change()
+        if change and change not in str(error):
+            raise TransientVideoError(change) from error
+        raise
+
+
+@contextlib.contextmanager
 def _stop_on_interrupt(results: TrackRun) -> Iterator[None]:
     """Let the first Ctrl-C end a live source, which has no other end; a second one interrupts the run."""
     if not results.source.live or threading.current_thread() is not threading.main_thread():
@@ -404,6 +431,7 @@ def cut_video(
         output = check_video_target(target, opened.files, preset=preset)
         first, count = frame_range(opened.info, start, end)
         with (
+            _name_changed_source(opened),
             opened.read(first, count) as frames,
             _open_writer(output, opened.info, preset, opened.audio(first, end)) as writer,
         ):

@@ -1,0 +1,332 @@
+"""`open_source`, which opens any source of frames."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from vehicle_detection._common import (
+    check_flags,
+    check_integer,
+    check_number,
+    check_path,
+    describe,
+    local_path,
+    temporary_folder,
+)
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.video.ffmpeg import NETWORK_TIMEOUT, input_options, source_name
+from vehicle_detection.video.files import IMAGE_SUFFIXES, check_file, is_video_file, list_files
+from vehicle_detection.video.live import LiveStream
+from vehicle_detection.video.probe import VideoInfo, probe
+from vehicle_detection.video.reading import FrameReader, check_span, frame_range
+from vehicle_detection.video.remote import download
+from vehicle_detection.video.sources import (
+    NO_RATE,
+    USUAL_FPS,
+    FrameSource,
+    ImageSequence,
+    Stream,
+    VideoFile,
+    VideoSegments,
+    exact_rate,
+)
+
+_LOGGER = logging.getLogger(__name__)
+
+_URL = re.compile(r"^([a-zA-Z][a-zA-Z0-9+.-]+)://")
+_STREAM_SCHEMES = ("rtsp", "rtsps", "rtmp", "rtmps", "udp", "rtp", "srt", "tcp")
+_RTSP_OPTIONS = ("-rtsp_transport", "tcp", "-timeout", f"{NETWORK_TIMEOUT * 1e6:.0f}")
+
+
+Source = str | os.PathLike[str] | int | Sequence[str | os.PathLike[str]] | FrameSource
+"""What `open_source` takes."""
+
+
+def open_source(
+    source: Source,
+    *,
+    fps: float | None = None,
+    stream: int | None = None,
+    live: bool | None = None,
+    reconnect: bool = True,
+    strict: bool = False,
+) -> FrameSource:
+    """Open any source of frames.
+
+    Parameters
+    ----------
+    source
+        - a video file, or a named pipe; ``"-"``: a video on standard input;
+        - a list of files: consecutive videos, which become one, or images; `open_trip` finds the files of a
+          trip in a folder;
+        - a folder or a glob pattern with images, in the order of their names, or with one video;
+        - a camera: its number (``0`` or ``"0"``) or device (``"/dev/video0"``);
+        - a network stream: ``rtsp://``, ``rtmp://``, ``udp://``, ``srt://``, or ``http(s)://``, which may
+          also be a file;
+        - a file on storage that fsspec knows, such as ``"s3://bucket/drive.mp4"``, which is copied to a
+          temporary file (extra ``[batch]``).
+    fps
+        Frame rate of images, raw streams such as ``drive.h264``, pipes, cameras and network streams; an error
+        for files with times. None: that which they state, else 25, with a warning.
+    stream
+        ffmpeg's number of the video stream, where a file has several. None: that which is marked as the
+        default, else the largest one, with a warning that lists the others.
+    live
+        Whether to drop frames that are not read in time, so that the newest frame is read next. None: for
+        cameras and network streams of unknown length. Otherwise, the sender has to wait.
+    reconnect
+        Whether to open a network stream of unknown length again when it ends or sends nothing for 10 seconds:
+        six attempts within about half a minute, which start over after 10 seconds of frames.
+    strict
+        Raise an error after the last frame if a file is damaged: frames are missing, or ffmpeg reports
+        decoding errors. Otherwise a warning is logged, and ``damage`` of the reader or of the report says it.
+        Streams are not checked.
+
+    Returns
+    -------
+    FrameSource
+        A context manager and an iterable of ``(index, time, frame)``. Dropped frames leave gaps in the
+        indices, and times stay right.
+
+    Examples
+    --------
+    >>> with open_source("test_images/*.jpg", fps=10) as source:
+    ...     for index, time, frame in source:
+    ...         if time >= 0.2:
+    ...             break
+    >>> index, frame.shape, source.info.frames
+    (2, (720, 1280, 3), 6)
+    """
+    if isinstance(source, FrameSource):
+        return source
+    check_flags(reconnect=reconnect, strict=strict)
+    if fps is not None:
+        fps = check_number(fps, "fps", above=0, high=1000)
+    if stream is not None:
+        stream = check_integer(stream, "stream", low=0, high=1000)
+    opened = _open(source, _Options(fps, stream, live, reconnect, strict))
+    opened.strict = strict
+    return opened
+
+
+@dataclass(frozen=True)
+class _Options:
+    """The options of `open_source`."""
+
+    fps: float | None
+    stream: int | None
+    live: bool | None
+    reconnect: bool
+    strict: bool
+
+    def probe(self, path: Path | str) -> VideoInfo:
+        """Read the properties of a file or URL, and apply the options to it."""
+        return self.check(path, probe(path, self.stream))
+
+    def check(self, path: Path | str, info: VideoInfo) -> VideoInfo:
+        """Return the properties with the frame rate of the options, if the file has no times."""
+        name = source_name(path)
+        if self.fps is None:
+            if not info.rate_stated:
+                _LOGGER.warning(NO_RATE, name)
+        elif info.is_raw:
+            if info.rate_stated and abs(info.fps - self.fps) > 0.01:
+                _LOGGER.warning("%s states %.5g frames/s; read with %g", name, float(info.fps), self.fps)
+            info = replace(info, fps=exact_rate(self.fps))
+        else:
+            raise InvalidInputError(
+                f"fps must be omitted for {name}, whose frames have times of their own "
+                f"({float(info.fps):.5g} frames/s); to change its speed, convert it with ffmpeg"
+            )
+        if info.other_streams and self.stream is None:
+            _LOGGER.warning(
+                "%s has several video streams: %d (%dx%d) is read, not %s; choose another one by its number, "
+                "with stream or --stream",
+                *(name, info.stream, info.width, info.height, info.other_streams),
+            )
+        return info
+
+    def open_stream(
+        self, name: str, options: Sequence[str], stdin: int = subprocess.DEVNULL, *, network: bool = False
+    ) -> LiveStream:
+        """Open a stream that is read once."""
+        if self.fps is not None:
+            *options, flag, place = options
+            rate = "-framerate" if "-f" in options else "-r"
+            options = [*options, rate, str(exact_rate(self.fps)), flag, place]
+        if self.stream is not None:
+            options = [*options, "-map", f"0:{self.stream}"]
+        opened = LiveStream(name, options, stdin=stdin, network=network, reconnect=self.reconnect)
+        if self.fps is None and opened.info.is_raw and opened.info.fps == USUAL_FPS:
+            _LOGGER.warning(NO_RATE, name)
+        return opened
+
+
+def _open(source: object, options: _Options) -> FrameSource:
+    """Open a source that is not yet open."""
+    if isinstance(source, int) and not isinstance(source, bool):
+        source = str(source)
+    if isinstance(source, (list, tuple)):
+        return _open_files([check_file(path) for path in source], options)
+    if not isinstance(source, (str, os.PathLike)):
+        raise InvalidInputError(
+            f"source must be the path of a video file, a folder, a pattern, a list of files, a URL, '-' or a "
+            f"camera's number, got {describe(source)}; pass a file name, or call detector.process(frame, "
+            "time) with frames of your own"
+        )
+    text = os.fsdecode(source)
+    if text == "-":
+        return _open_stdin(options)
+    if scheme := _URL.match(text):
+        return _open_url(text, scheme[1].lower(), options)
+    path = check_path(text, "source", kind="the path of a video file")
+    if (text.isdecimal() and not path.exists()) or text.startswith("/dev/video"):
+        return _open_camera(text, options)
+    if path.is_fifo():
+        return Stream(options.open_stream(text, input_options(path)), live=bool(options.live))
+    files = list_files(path) or [check_file(path)]
+    if len(files) > 1 and is_video_file(files[0]):
+        raise InvalidInputError(
+            f"source {path} holds {len(files)} videos; open the segments of one trip with open_trip, or pass "
+            "a list of consecutive files"
+        )
+    return _open_files(files, options)
+
+
+@contextlib.contextmanager
+def borrow_source(source: Source) -> Iterator[FrameSource]:
+    """Open a source for a block; one that the caller has opened stays open."""
+    if isinstance(source, FrameSource):
+        yield source
+        return
+    with open_source(source) as opened:
+        yield opened
+
+
+def _open_files(files: Sequence[Path], options: _Options) -> FrameSource:
+    """Open one file, the segments of a trip or images."""
+    if not files:
+        raise InvalidInputError("source must name at least one file, got an empty list; add a file")
+    images = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
+    if len(images) == len(files):
+        if options.stream is not None:
+            raise InvalidInputError(f"stream must be omitted for images, got {options.stream}; omit it")
+        return ImageSequence(files, options.fps)
+    if images:
+        raise InvalidInputError(
+            f"source must be videos or images, got both ({files[0]}, {images[0]}); select one kind"
+        )
+    if len(files) == 1:
+        return VideoFile(files[0], options.probe(files[0]))
+    broken = next((path for path in files if "\n" in str(path) or "\r" in str(path)), None)
+    if broken is not None:  # the list of files for ffmpeg has a line for each
+        raise InvalidInputError(f"source {str(broken)!r} has a line break in its name; rename the file")
+    return VideoSegments(files, options.probe, strict=options.strict)
+
+
+def _open_stdin(options: _Options) -> FrameSource:
+    try:
+        descriptor = sys.stdin.fileno()
+    except (AttributeError, OSError, ValueError):
+        descriptor = -1
+    if descriptor < 0 or os.isatty(descriptor):
+        raise InvalidInputError(
+            "source - reads a video from standard input, which is not a pipe; use: cat drive.mp4 | ..."
+        )
+    return Stream(options.open_stream("-", ("-i", "pipe:0"), descriptor), live=bool(options.live))
+
+
+def _open_camera(name: str, options: _Options) -> FrameSource:
+    live = options.live is not False
+    if sys.platform == "darwin":
+        settings = ("-f", "avfoundation", "-framerate", "30", "-i", name)
+        return Stream(options.open_stream(name, settings), live=live)
+    if sys.platform == "win32":
+        raise InvalidInputError(
+            f"source {name}: cameras are not supported on Windows; pipe the output of ffmpeg -f dshow to '-'"
+        )
+    device = f"/dev/video{name}" if name.isdecimal() else name
+    if not Path(device).exists():
+        raise InvalidInputError(f"source {name}: there is no camera {device}; see ls /dev/video*")
+    return Stream(options.open_stream(name, ("-f", "v4l2", "-i", device)), live=live)
+
+
+def _open_url(url: str, scheme: str, options: _Options) -> FrameSource:
+    if scheme == "file":
+        return _open(local_path(url), options)
+    if scheme in ("http", "https"):
+        info = None if options.live else probe(url, options.stream)
+        if info is not None and info.duration:
+            return VideoFile(url, options.check(url, info))
+    elif scheme not in _STREAM_SCHEMES:
+        return _download(url, options)
+    settings = (*(_RTSP_OPTIONS if scheme.startswith("rtsp") else ()), "-i", url)
+    opened = options.open_stream(source_name(url), settings, network=True)
+    return Stream(opened, live=options.live is not False)
+
+
+def _download(url: str, options: _Options) -> FrameSource:
+    """Copy a file of other storage to a temporary one, because a video is read at several places."""
+    with contextlib.ExitStack() as on_error:
+        folder = on_error.enter_context(temporary_folder(Path(tempfile.gettempdir()), "vehicle-source"))
+        path = download(url, folder)
+        source = VideoFile(path, options.probe(path))
+        source.name = source_name(url)
+        source._on_close = on_error.pop_all()
+    return source
+
+
+def probe_video(path: str | os.PathLike[str]) -> VideoInfo:
+    """Read the properties of a video file: frame size, exact frame rate, length, sound and rotation.
+
+    >>> probe_video("missing.mp4")
+    Traceback (most recent call last):
+    ...
+    vehicle_detection.errors.InvalidInputError: source missing.mp4 does not exist; check the path
+    """
+    return probe(check_file(path))
+
+
+def read_frames(
+    source: str | os.PathLike[str],
+    *,
+    start: float | None = None,
+    end: float | None = None,
+    strict: bool = False,
+) -> FrameReader:
+    """Read the frames of a video file, one at a time; for other sources see `open_source`.
+
+    Parameters
+    ----------
+    source
+        A file that ffmpeg can read.
+    start, end
+        Time range in seconds: frames with ``start <= time < end`` are read. None: no limit.
+    strict
+        Raise an error after the last frame if the file is damaged, as in `open_source`.
+
+    Returns
+    -------
+    FrameReader
+        An iterator of ``(index, time, frame)``: the frame's number in the file from 0, its time in seconds,
+        and an upright ``(H, W, 3)`` uint8 RGB array. Its ``info`` is the file's `VideoInfo`. ffmpeg ends
+        after the last frame, and at the end of a ``with`` block.
+
+    Examples
+    --------
+    >>> with read_frames("drive.mp4", end=2.0) as frames:  # doctest: +SKIP
+    ...     means = [frame.mean() for index, time, frame in frames]
+    """
+    path = check_file(source)
+    info = probe(path)
+    first, count = frame_range(info, *check_span(start, end))
+    return FrameReader(path, info, first=first, count=count, strict=strict)
