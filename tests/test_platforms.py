@@ -39,7 +39,7 @@ GUARDED = {
     ("network.model", "", "os.register_at_fork"): "hasattr",
     ("training.trials", "_check_memory", "os.sysconf"): "AttributeError is caught",
     ("drive.worker_pool", "_prepare", "os.setpgid"): "hasattr",
-    ("drive.worker_pool", "_private_folder", "os.getuid"): "hasattr",
+    ("_common.files", "private_folder", "os.getuid"): "hasattr",
     ("video.ffmpeg", "", "os.register_at_fork"): "hasattr",
     ("video.ffmpeg", "_enlarge", "fcntl"): "on Linux only",
     ("video.ffmpeg", "_is_memory_limited", "resource"): "ImportError is caught",

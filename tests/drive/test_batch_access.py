@@ -203,10 +203,10 @@ def test_a_bad_segment_of_a_server_is_named(signed, model, tmp_path):
     signed.files["cam/20260131_081501_F.mp4"] = b"\0" * 3000
     urls = [signed.url(name, "ab12") for name in ("081500", "081501")]
     report = run(urls, tmp_path / "out", model, tracks_only=True)
-    assert counts(report) == (0, 1, 0, 0)
-    (message,) = report.messages.values()
-    start = f"http://127.0.0.1:{signed.server_address[1]}/cam/20260131_081501_F.mp4 is not a video"
-    assert message.startswith(start)
+    assert counts(report) == (1, 0, 0, 0)
+    (record,) = check_whole(tmp_path / "out", done=1, failed=0).values()
+    named = f"http://127.0.0.1:{signed.server_address[1]}/cam/20260131_081501_F.mp4 is not a video"
+    assert record["damage"].startswith(f"the last segment is left out: {named}")
 
 
 def test_the_identity_of_a_url_does_not_depend_on_what_is_hidden_in_its_record():

@@ -34,6 +34,7 @@ from vehicle_detection._common.files import (
     check_target,
     is_hidden,
     open_locked,
+    private_folder,
     temporary_folder,
     write_text,
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import logging
 import os
 import shutil
 import signal
@@ -18,6 +19,8 @@ from typing import Any
 
 from vehicle_detection._common.checks import check_path
 from vehicle_detection.errors import InvalidInputError, OutputError, VehicleDetectionError
+
+_LOGGER = logging.getLogger(__name__)
 
 _FULL = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
 _DISK_ERRORS = (*_FULL, errno.EROFS, errno.EIO)
@@ -226,6 +229,27 @@ def _remove(parts: list[Path]) -> None:
         with contextlib.suppress(OSError):  # the first error is the one to report
             parts[0].unlink()
         parts.clear()
+
+
+def private_folder(name: str) -> str:
+    """Create a folder for temporary files that only this user can write; empty if that is impossible.
+
+    numba's cache holds pickled objects, so another user must not have created it.
+    """
+    if not hasattr(os, "getuid"):  # Windows, where the folder of temporary files is private
+        return str(Path(tempfile.gettempdir()) / name)
+    user = os.getuid()  # containers may have users without a name
+    try:
+        folder = Path(tempfile.gettempdir()) / f"{name}-{user}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        _LOGGER.warning("%s cannot be created (%s); kernels are kept elsewhere", name, error.strerror)
+        return ""
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != user or found.st_mode & 0o022:
+        _LOGGER.warning("%s can be written by other users; remove it, kernels are kept elsewhere", folder)
+        return ""
+    return str(folder)
 
 
 @contextlib.contextmanager

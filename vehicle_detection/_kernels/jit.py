@@ -5,17 +5,15 @@ from __future__ import annotations
 import contextlib
 import functools
 import gc
-import getpass
 import logging
-import os
-import stat
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
 import numba
 from numba.core import event
+
+from vehicle_detection._common import private_folder
 
 log = logging.getLogger(__name__)
 
@@ -53,24 +51,11 @@ def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[...,
 
 @functools.cache
 def _temporary_cache() -> str:
-    """Return a temporary folder for kernels, which no other user can write; empty if there is none."""
-    user = os.getuid() if hasattr(os, "getuid") else getpass.getuser()
-    try:
-        folder = Path(tempfile.gettempdir(), f"vehicle-detection-kernels-{user}")
-        folder.mkdir(mode=0o700, exist_ok=True)
-        status = folder.lstat()
-    except OSError:
-        status = None
-    if status is None or not stat.S_ISDIR(status.st_mode) or _is_shared(status):
-        log.warning("no folder for compiled kernels is writable: each process compiles them, for 15 s")
-        return ""
-    log.warning("the package and the user's cache are not writable: compiled kernels are kept in %s", folder)
-    return str(folder)
-
-
-def _is_shared(status: os.stat_result) -> bool:
-    """Whether another user may write to a folder, and so choose the code that is loaded from it."""
-    return hasattr(os, "getuid") and (status.st_uid != os.getuid() or bool(status.st_mode & 0o022))
+    """Return a temporary folder for compiled kernels, and say so; empty if there is none."""
+    folder = private_folder("vehicle-detection-kernels")
+    where = f"kept in {folder}" if folder else "compiled in every process, which takes 15 seconds"
+    log.warning("the package and the user's cache are not writable: kernels are %s", where)
+    return folder
 
 
 def _save(save: Callable[..., None], *overload: Any) -> None:

@@ -184,7 +184,7 @@ def _from_first_point(points: Floats, name: str) -> Floats:
             f"path {name} must have at least two track points with times, got {len(points)}; export a "
             "recorded track, not a route"
         )
-    return points - [points[0, 0], 0, 0, 0]
+    return np.asarray(points - [points[0, 0], 0, 0, 0])
 
 
 def _plausible_speeds(points: Floats, name: str) -> tuple[Floats, Floats]:

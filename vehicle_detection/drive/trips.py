@@ -22,7 +22,7 @@ from typing import Any
 
 from vehicle_detection._common import check_sequence, describe, is_url, pluralize
 from vehicle_detection.errors import InvalidInputError, VideoError
-from vehicle_detection.video import FrameSource, Source, is_video_file, list_files, open_source
+from vehicle_detection.video import FrameSource, Source, is_video_file, list_files, open_source, probe_video
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -147,12 +147,9 @@ def find_trips(files: Iterable[File], *, duration: Callable[[File], float] | Non
 
 def probe_length(file: File) -> float:
     """Length of a video in seconds; 0 if it is unknown, as on storage from which it would be copied."""
-    text = str(file)
+    copied = is_url(str(file)) and not str(file).startswith(("http://", "https://"))
     try:
-        if is_url(text) and not text.startswith(("http://", "https://")):
-            return 0.0
-        with open_source(file) as source:
-            return source.info.duration
+        return 0.0 if copied else probe_video(file).duration
     except (InvalidInputError, VideoError):  # reported when its trip is processed
         return 0.0
 

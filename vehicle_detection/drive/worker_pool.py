@@ -11,8 +11,6 @@ import logging
 import multiprocessing
 import os
 import signal
-import stat
-import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import (
@@ -25,11 +23,10 @@ from concurrent.futures import (
 )
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from vehicle_detection._common import JOBS_VARIABLE, available_cores, postpone
+from vehicle_detection._common import JOBS_VARIABLE, available_cores, postpone, private_folder
 from vehicle_detection.errors import InvalidInputError
 
 _LOGGER = logging.getLogger(__name__)
@@ -49,29 +46,8 @@ def worker_environment() -> dict[str, str]:
     A cache on shared storage is corrupted by processes of several machines.
     """
     threads = dict.fromkeys((JOBS_VARIABLE, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    cache = os.environ.get("NUMBA_CACHE_DIR") or _private_folder("vehicle-detection-kernels")
+    cache = os.environ.get("NUMBA_CACHE_DIR") or private_folder("vehicle-detection-kernels")
     return threads | ({"NUMBA_CACHE_DIR": cache} if cache else {})
-
-
-def _private_folder(name: str) -> str | None:
-    """Create a folder for temporary files that only this user can write; None if that is impossible.
-
-    numba's cache holds pickled objects, so another user must not have created it.
-    """
-    if not hasattr(os, "getuid"):  # Windows, where the folder of temporary files is private
-        return str(Path(tempfile.gettempdir()) / name)
-    user = os.getuid()  # containers may have users without a name
-    folder = Path(tempfile.gettempdir()) / f"{name}-{user}"
-    try:
-        folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
-    except OSError as error:
-        _LOGGER.warning("%s cannot be created (%s); kernels are kept elsewhere", folder, error.strerror)
-        return None
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != user or found.st_mode & 0o022:
-        _LOGGER.warning("%s can be written by other users; remove it, kernels are kept elsewhere", folder)
-        return None
-    return str(folder)
 
 
 class WorkerPool(ThreadPoolExecutor):

@@ -41,7 +41,7 @@ _RAISE_LIMITS = "close other programs, or raise the limits of this process (ulim
 # Messages of ffmpeg about threads or open files that the system refuses.
 _SYSTEM_FAULT = re.compile(r"^.*(Resource temporarily unavailable|Too many open files).*$", re.MULTILINE)
 # Lines that follow the messages about errors.
-_STATISTICS = re.compile(r"Conversion failed!|frame= |video:|Nothing was written")
+_STATISTICS = re.compile(r"Conversion failed!|frame= |video:")
 _NO_MEMORY = "Cannot allocate memory"
 NETWORK_TIMEOUT = 10.0
 """Seconds without data after which a server has failed."""

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from vehicle_detection._common import (
@@ -107,6 +107,8 @@ def open_source(
     (2, (720, 1280, 3), 6)
     """
     if isinstance(source, FrameSource):
+        if fps is not None or stream is not None:
+            raise InvalidInputError(f"source {source.name} is open already; omit fps and stream")
         return source
     check_flags(reconnect=reconnect, strict=strict)
     if fps is not None:
@@ -120,13 +122,19 @@ def open_source(
 
 @dataclass(frozen=True)
 class _Options:
-    """The options of `open_source`."""
+    """The options of `open_source`; each warning is logged once, not for every segment of a trip."""
 
     fps: float | None
     stream: int | None
     live: bool | None
     reconnect: bool
     strict: bool
+    warned: set[str] = field(default_factory=set)
+
+    def _warn(self, message: str, *values: object) -> None:
+        if message not in self.warned:
+            self.warned.add(message)
+            _LOGGER.warning(message, *values)
 
     def probe(self, path: Path | str) -> VideoInfo:
         """Read the properties of a file or URL, and apply the options to it."""
@@ -137,10 +145,10 @@ class _Options:
         name = source_name(path)
         if self.fps is None:
             if not info.rate_stated:
-                _LOGGER.warning(NO_RATE, name)
+                self._warn(NO_RATE, name)
         elif info.is_raw:
             if info.rate_stated and abs(info.fps - self.fps) > 0.01:
-                _LOGGER.warning("%s states %.5g frames/s; read with %g", name, float(info.fps), self.fps)
+                self._warn("%s states %.5g frames/s; read with %g", name, float(info.fps), self.fps)
             info = replace(info, fps=exact_rate(self.fps))
         else:
             raise InvalidInputError(
@@ -148,7 +156,7 @@ class _Options:
                 f"({float(info.fps):.5g} frames/s); to change its speed, convert it with ffmpeg"
             )
         if info.other_streams and self.stream is None:
-            _LOGGER.warning(
+            self._warn(
                 "%s has several video streams: %d (%dx%d) is read, not %s; choose another one by its number, "
                 "with stream or --stream",
                 *(name, info.stream, info.width, info.height, info.other_streams),
@@ -167,7 +175,7 @@ class _Options:
             options = [*options, "-map", f"0:{self.stream}"]
         opened = LiveStream(name, options, stdin=stdin, network=network, reconnect=self.reconnect)
         if self.fps is None and opened.info.is_raw and opened.info.fps == USUAL_FPS:
-            _LOGGER.warning(NO_RATE, name)
+            self._warn(NO_RATE, name)
         return opened
 
 
@@ -286,14 +294,14 @@ def _download(url: str, options: _Options) -> FrameSource:
 
 
 def probe_video(path: str | os.PathLike[str]) -> VideoInfo:
-    """Read the properties of a video file: frame size, exact frame rate, length, sound and rotation.
+    """Read the properties of a video file or web address: frame size, exact frame rate, length, sound.
 
     >>> probe_video("missing.mp4")
     Traceback (most recent call last):
     ...
     vehicle_detection.errors.InvalidInputError: source missing.mp4 does not exist; check the path
     """
-    return probe(check_file(path))
+    return probe(path if isinstance(path, str) and _URL.match(path) else check_file(path))
 
 
 def read_frames(
@@ -326,7 +334,7 @@ def read_frames(
     >>> with read_frames("drive.mp4", end=2.0) as frames:  # doctest: +SKIP
     ...     means = [frame.mean() for index, time, frame in frames]
     """
-    path = check_file(source)
-    info = probe(path)
-    first, count = frame_range(info, *check_span(start, end))
+    path, span = check_file(source), check_span(start, end)
+    info = _Options(None, None, None, False, strict).probe(path)
+    first, count = frame_range(info, *span)
     return FrameReader(path, info, first=first, count=count, strict=strict)
