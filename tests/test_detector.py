@@ -515,14 +515,6 @@ def test_boxes_have_at_least_the_confidence(scene, name):
     assert max(found[0.1].confidences) == pytest.approx(best, abs=1e-6)
 
 
-def test_weak_groups_of_windows_need_less_evidence():
-    strict = Detector("highway", conf=0.99).region_params
-    loose = Detector("highway", conf=0.05, region_params=RegionParams(min_iou=0.4)).region_params
-    assert strict.min_peak > RegionParams().min_peak > loose.min_peak
-    assert strict.min_evidence == RegionParams().min_evidence > loose.min_evidence
-    assert loose == dataclasses.replace(loose, min_iou=0.4)
-
-
 def test_a_heat_map_has_no_confidence(scene):
     with VehicleDetector("highway", region_params=HeatParams()) as detector:
         assert detector.detect(scene.image).confidences is None

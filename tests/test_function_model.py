@@ -18,7 +18,6 @@ from vehicle_detection.function_model import FunctionModel, FunctionParams, dete
 from vehicle_detection.heatmap import HeatParams
 from vehicle_detection.notebook import Explorer
 from vehicle_detection.tables import TrackTable
-from vehicle_detection.tracking import TrackParams
 from vehicle_detection.video import process_video
 
 SHAPE = (120, 200)
@@ -94,17 +93,6 @@ def test_scores_become_log_odds_above_the_threshold(options, scores, expected):
     shown = np.array(expected) >= -1e-9
     assert len(detector.detect(frame_with())) == shown.sum()
     assert len(detector.search(frame_with()).vehicles) == (np.array(expected) >= -1.5).sum()
-
-
-def test_the_documented_probabilities_confirm_and_continue_tracks():
-    tracks = TrackParams()
-    assert [round(1 / (1 + np.exp(-score)), 2) for score in (
-        tracks.high_threshold, tracks.confirm_score, tracks.low_threshold
-    )] == [0.43, 0.55, 0.18]  # fmt: skip
-    for probability, shown in ((0.53, 0), (0.6, 1)):
-        detector = detector_from(returning([BOX], [probability]))
-        results = [detector.process(frame_with(), step / 25) for step in range(40)]
-        assert len(results[-1].shown) == shown
 
 
 @pytest.mark.parametrize("class_ids", [[2], (2, 5), {2}, np.array([2, 7])])

@@ -90,17 +90,6 @@ def test_evaluate_reads_yolo_folders_with_the_sizes_of_images(tmp_path):
     assert "the folder of the images as images= or --images" in refuse("evaluate", found, labels)
 
 
-def test_evaluate_names_the_files_whose_frames_differ(tmp_path):
-    labels, found = tmp_path / "labels.csv", tmp_path / "found.csv"
-    labels.write_text("frame,track,x1,y1,x2,y2\na,1,10,10,60,50\n")
-    found.write_text(f"{HEADER}\nin/a.jpg,1,10,10,60,50,1\n")
-    for words in ((), ("--frames", tmp_path / "part.txt")):
-        (tmp_path / "part.txt").write_text("a\n")
-        assert "1 found, 0 missed, 0 false" in succeed("evaluate", found, labels, *words)
-    found.write_text(f"{HEADER}\nin/a.jpg,1,10,10,60,50,1\nout/a.jpg,1,10,10,60,50,1\n")
-    assert f"frame names of {found} and {labels} differ: 'out/a.jpg'" in refuse("evaluate", found, labels)
-
-
 def test_evaluate_refuses_bad_input(material, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("other.csv").write_text("a,b\n1,2\n")

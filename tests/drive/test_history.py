@@ -69,17 +69,6 @@ def test_an_outlier_is_not_the_closest_approach():
     assert approach.std_m == 1.0
 
 
-def test_the_closest_approach_of_few_known_distances_and_in_other_units():
-    assert history([5], [12.0]).closest_approach(25.0) == (5, 12.0, 1.0)
-    assert history([5, 6], [math.nan, 12.0]).closest_approach(0.1).frame == 6
-    assert history([5], [math.nan]).closest_approach(25.0) is None
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        distances = rng.uniform(5, 9, 40).round(2)
-        meters, feet = (history(range(40), distances * unit).closest_approach(25) for unit in (1, 1 / 0.3048))
-        assert meters.frame == feet.frame
-
-
 def test_speeds_in_frames_that_are_not_evenly_spaced():
     table = TrackTable()
     for frame, time in enumerate((5.0, 5.1, None, 5.5)):

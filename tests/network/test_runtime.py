@@ -9,7 +9,7 @@ from onnx import helper
 
 from tests.network.graphs import own_network, serialize
 from vehicle_detection.errors import DetectorError, InvalidInputError, ModelFileError
-from vehicle_detection.network import load_network, open_session, read_facts
+from vehicle_detection.network import load_network, open_session
 from vehicle_detection.network.runtime import _prefers_openvino
 
 NO_OPENVINO = importlib.util.find_spec("openvino") is None
@@ -28,15 +28,6 @@ def test_a_session_runs_inputs_of_any_size(runtime):
     with pytest.raises(DetectorError, match="the network failed on an input of shape"):
         session.run({"image": np.zeros((1, 8, 8, 3), np.uint8)})
     session.close()
-
-
-def test_facts():
-    facts = read_facts(own_network(), "the network")
-    assert [(port.name, port.shape, port.dtype) for port in facts.inputs] == [
-        ("image", (1, None, None, 3), "uint8")
-    ]
-    assert facts.outputs[0].shape == (1, 5, None)
-    assert set(facts.metadata) == {"vehicle_detection"}
 
 
 def test_openvino_is_chosen_for_matrix_units_only(tmp_path):

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from vehicle_detection.boxes import iou_matrix
-from vehicle_detection.camera import Camera
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.heatmap import HeatParams, frame_heat
+from vehicle_detection.heatmap import HeatParams
 from vehicle_detection.images import write_image
 from vehicle_detection.network import NetworkParams
 from vehicle_detection.notebook import Explorer
@@ -82,30 +81,6 @@ def test_windows_and_boxes_equal_those_of_the_detector(scenes, model, method, mi
             np.testing.assert_array_equal(actual.scores, wanted.scores)
         if method == "groups":
             np.testing.assert_array_equal(explorer.boxes().confidences, found.confidences)
-
-
-def test_the_given_parameters_are_used(scenes):
-    camera = Camera.for_frame(SHAPE, horizon=0.56, height_m=2.0)
-    params = SearchParams.preset("three-scales")
-    counted = HeatParams(weighting="count")
-    heated = explore(scenes, search_params=params, region_params=counted, camera=camera)
-    assert heated.method == "heat"
-    np.testing.assert_array_equal(heated.heat_map(), frame_heat(SHAPE, heated.windows(), counted))
-    detector = heated.detector(jobs=1)
-    assert detector.camera == camera
-    assert detector.detector.region_params == counted.for_search(params)
-    assert detector.detector.search_params == params
-    heated.set_regions(
-        "groups", threshold=4.0, peak_fraction=0.1, weighting="score", min_peak=0.2, min_evidence=0.3
-    )
-    assert heated.heat_params == HeatParams(threshold=4.0, peak_fraction=0.1)
-    assert heated.group_params == heated.region_params == RegionParams(min_peak=0.2, min_evidence=0.3)
-    assert heated.detector(jobs=1).detector.region_params == heated.group_params
-    assert heated.method == "groups"
-    heated.set_regions(threshold=0.0)
-    assert (heated.heat_params.threshold, heated.method) == (0.0, "groups")
-    grouped = explore(scenes, region_params=RegionParams(min_peak=1.0))
-    assert (grouped.method, grouped.group_params.min_peak) == ("groups", 1.0)
 
 
 def test_the_horizon_of_a_network_is_that_of_the_camera(scenes):

@@ -54,13 +54,6 @@ def test_images_have_titles_and_boxes():
     assert second.images[0].get_cmap().name == "gray"
 
 
-def test_the_grid_has_no_empty_panels():
-    figure = notebook.show_images([gray_image()] * 5, columns=2)
-    places = [axes.get_subplotspec().get_geometry()[:2] for axes in figure.axes]
-    assert places == [(3, 2)] * 5
-    assert len(notebook.show_images([gray_image()] * 4).axes) == 4
-
-
 def test_methods_are_shown_side_by_side():
     found = [Detections([[0, 0, 9, 9]], [1.0]), Detections.empty()]
     none = [Detections.empty()] * 2

@@ -127,21 +127,6 @@ def test_a_parameter_is_plotted_with_the_deviation_of_its_runs():
     assert legend(axes) == ["x"]
 
 
-def test_parameters_may_be_text_or_numbers():
-    table = pd.DataFrame(
-        {"color_space": ["LUV", "YCrCb", "LUV"], "orient": [8, 9, 9], "frame_f1": [0.5, 0.75, 0.7]}
-    )
-    words = notebook.plot_parameter(table, "color_space", quality="frame_f1", ax=new_axes())
-    assert texts(words.get_xticklabels()) == ["LUV", "YCrCb"]
-    np.testing.assert_allclose(words.lines[0].get_xydata(), [[0, 0.6], [1, 0.75]])
-    assert words.get_legend() is None
-    assert words.get_ylabel() == "F1 on frames"
-    numbers = notebook.plot_parameter(table, "orient", quality="frame_f1", ax=new_axes())
-    assert numbers.get_xscale() == "linear"
-    mixed = pd.DataFrame({"C": [1, "ALL"], "accuracy": [0.5, 0.6]})
-    assert texts(notebook.plot_parameter(mixed, "C", ax=new_axes()).get_xticklabels()) == ["1", "ALL"]
-
-
 def test_the_legend_counts_the_errors_of_both_classes():
     scores, labels = [2.0, 1.0, -0.25, 0.0, -1.0, 0.5], [1, 1, 1, 1, 0, 0]
     axes = notebook.plot_scores(scores, labels, bins=12, ax=new_axes())

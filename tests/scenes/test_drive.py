@@ -80,24 +80,6 @@ def test_an_overtaking_car_enters_at_a_side_and_pulls_away(seed):
     assert all(row.speed_mps > 0 for row in rows.values())
 
 
-@pytest.mark.parametrize("scenario", ["crossing", "occlusion"])
-@pytest.mark.parametrize("seed", range(2))
-def test_two_cars_swap_sides(scenario, seed):
-    drive = render_drive(frames=60, fps=10, shape=SMALL, scenario=scenario, random_state=seed)
-    tracks = truth_by_track(drive, every=3)
-
-    def center(row):
-        return (row.full_box[0] + row.full_box[2]) / 2
-
-    pairs = [(tracks[1][frame], tracks[2][frame]) for frame in range(0, 60, 3)]
-    gaps = [center(first) - center(second) for first, second in pairs]
-    assert gaps[0] * gaps[-1] < 0
-    overlaps = [first.box[0] < second.box[2] and second.box[0] < first.box[2] for first, second in pairs]
-    assert any(overlaps)
-    assert not overlaps[0]
-    assert not overlaps[-1]
-
-
 @pytest.mark.parametrize(("frames", "seed"), [(50, 0), (75, 1), (100, 2)])
 def test_occlusion_hides_a_car_for_about_a_second(frames, seed):
     drive = render_drive(frames=frames, shape=SMALL, scenario="occlusion", random_state=seed)

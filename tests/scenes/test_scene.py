@@ -117,17 +117,6 @@ def test_a_nearer_vehicle_occludes_a_farther_one():
     assert row.box == render_scene(vehicles=[beside]).truth[0].box
 
 
-def test_truncation_grows_towards_the_border():
-    truncated = [
-        render_scene(vehicles=[SceneVehicle(distance_m=9, lateral_m=x, kind="sedan")]).truth[0].truncated
-        for x in (2.0, 4.0, 5.0, 5.6)
-    ]
-    assert truncated[0] == 0
-    assert truncated == sorted(truncated)
-    assert truncated[-1] > 0.4
-    assert render_scene(vehicles=[SceneVehicle(distance_m=9, lateral_m=20)]).truth == ()
-
-
 @pytest.mark.parametrize(
     ("options", "refused"),
     [

@@ -130,12 +130,6 @@ def test_labels_without_an_image_are_reported(tmp_path, caplog):
     assert "such as 'none.png'; they are left out" in caplog.text
 
 
-def test_labels_of_another_resolution(tmp_path):
-    write_source(tmp_path, "road", 2, ["1.png,1,10,10,60,50\n", "1.png,2,500,10,560,50\n"])
-    with pytest.raises(InvalidInputError, match=r"road, .*'1.png': the box \[500.0, .* outside the 160x90"):
-        load_training_frames(find_sources(tmp_path))
-
-
 @pytest.mark.parametrize(
     ("labelled", "chosen"),
     [

@@ -54,19 +54,7 @@ def test_moving_boxes_there_and_back(view, sides):
     np.testing.assert_allclose(back, boxes, atol=1e-6)
 
 
-def test_frames_with_vehicles_are_drawn_more_often():
-    weights = Sampler([frame(boxes=()), frame(), frame(boxes=[(1, 1, 20, 20)] * 6)], SIZE).weights
-    assert weights.sum() == pytest.approx(1)
-    assert weights[0] < weights[1] < weights[2]
-
-
 def test_a_source_counts_with_the_square_root_of_its_size():
     many = [dataclasses.replace(frame(), source="many") for _ in range(16)]
     weights = Sampler([*many, frame()], SIZE).weights
     assert weights[:16].sum() == pytest.approx(4 * weights[16])
-
-
-def test_covered_vehicles_become_neither_vehicle_nor_background():
-    sampler = Sampler([frame()], SIZE)
-    unclear = [sampler.draw(np.random.default_rng(seed)) for seed in range(80)]
-    assert any(len(sample.ignored) and not len(sample.boxes) for sample in unclear)

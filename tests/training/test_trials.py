@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from tests.training.trial_cases import SEARCH, SMALL, UNTIMED
-from vehicle_detection.datasets import PatchSet, make_split, split_sequences
+from vehicle_detection.datasets import make_split, split_sequences
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, evaluate_detections
@@ -44,16 +44,6 @@ def test_a_trial_equals_training_on_that_part(patch_set, mirror, split):
     assert row["train_accuracy"] == classifier.score(train.patches, train.labels)
     assert (row["train_size"], row["test_size"]) == (len(train), len(test))
     assert row["mirror"] is mirror
-
-
-def test_a_weight_on_vehicles_finds_more_of_them(patch_set):
-    noise = np.random.default_rng(0).integers(0, 2, len(patch_set)).astype(bool)
-    noisy = PatchSet(patch_set.patches, patch_set.labels ^ noise, patch_set.names)
-    trials = Trials(noisy, UNTIMED, RowStore(None, COLUMNS))
-    configurations = [{**SMALL, "mirror": False, "positive_weight": weight} for weight in (0.05, 1.0, 20.0)]
-    trained = [trials.train(each, np.arange(120), 0) for each in read_configurations(configurations)]
-    few, some, many = (classifier.predict(noisy.patches).sum() for classifier in trained)
-    assert few < some < many
 
 
 def test_features_that_exceed_the_memory_fail(patch_set, monkeypatch):
