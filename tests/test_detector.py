@@ -382,6 +382,18 @@ def test_the_documented_code_for_own_frames_and_images(capsys):
         names["find_vehicles"](data[:50])
 
 
+def test_only_single_images_are_read_from_files():
+    detector = make()
+    for take in (detector.process, detector.search):
+        with pytest.raises(
+            InvalidInputError, match=r"^frame must be .*read files with vehicle_detection\.read_"
+        ):
+            take("frame.png")
+    for take in (detector.detect, detector):
+        with pytest.raises(InvalidInputError, match=r"frame\.png"):
+            take("frame.png")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -476,6 +488,18 @@ def test_a_second_thread_is_refused():
                 pool.submit(call, frames[1]).result()
         assert len(pool.submit(detector.detect, frames[1]).result()) > 0
     assert detector.process(frames[1]).index == 1
+
+
+def test_a_shallow_copy_shares_the_search_and_has_its_own_tracks():
+    detector, frames = make(), drive()
+    for frame in frames[:6]:
+        detector.process(frame)
+    other = copy.copy(detector)
+    assert other.model is detector.model
+    assert other.detector is detector.detector
+    other.process(frame_with(light=200))  # a cut
+    assert detector.process(frames[6]).tracks
+    assert not other.process(frame_with(light=200)).tracks
 
 
 def test_parts_can_be_passed_in():

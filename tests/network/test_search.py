@@ -1,4 +1,6 @@
 import dataclasses
+import multiprocessing
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -109,6 +111,26 @@ def test_threads(file, runtime):
         expected = [search.find(image) for image in images]
         for one, other in zip(expected * 3, pool.map(search.find, images * 3)):
             check_equal(one, other)
+
+
+SEARCH = None
+
+
+def search_in_child(_):
+    return SEARCH.find(IMAGE).vehicles.boxes
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="fork is safe on Linux only")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("runtime", RUNTIMES)
+def test_a_forked_process(file, runtime):
+    global SEARCH
+    with load_network(file, runtime=runtime).open_search(jobs=2) as SEARCH:
+        expected = SEARCH.find(IMAGE).vehicles.boxes
+        with multiprocessing.get_context("fork").Pool(1) as pool:
+            (boxes,) = pool.map_async(search_in_child, [0]).get(timeout=60)
+            np.testing.assert_array_equal(boxes, expected)
+        np.testing.assert_array_equal(SEARCH.find(IMAGE).vehicles.boxes, expected)
 
 
 SEARCH = None
