@@ -320,16 +320,15 @@ class Trials:
         labels = check_labels(self.labels[rows], len(rows))
         copies = (False, True) if candidate.training.mirror else (False,)
         _check_memory(candidate.params.length, len(self.labels), len(rows), len(copies))
-        # One after the other, as the features of each copy are as large as the joined ones.
         features = np.concatenate([self.cache.rows(candidate.params, rows, mirrored=copy) for copy in copies])
         options = dataclasses.replace(candidate.training, random_state=seed)
         return fit_features(features, labels, candidate.params, options)
 
     def _score_frames(self, classifier: VehicleClassifier) -> dict[str, Any]:
         """Mean of each metric over the sets of frames, and the F1 score of each set as text."""
-        scores = {each.name: self._score_set(classifier, each) for each in self._options.frame_sets}
         import pandas as pd
 
+        scores = {each.name: self._score_set(classifier, each) for each in self._options.frame_sets}
         # The mean of a metric without any value is NaN.
         means = pd.DataFrame(scores, _FRAME_METRICS).mean(axis=1)
         by_set = "; ".join(f"{name} {f1:.4f}" for name, (f1, *_) in scores.items())
@@ -337,10 +336,8 @@ class Trials:
 
     def _score_set(self, classifier: VehicleClassifier, frames: LabelledFrames) -> tuple[float, ...]:
         """Values of `_FRAME_METRICS` on a set of frames."""
-        search, regions = (
-            self._options.search_params.with_horizon(frames.horizon),
-            self._options.region_params,
-        )
+        search = self._options.search_params.with_horizon(frames.horizon)
+        regions = self._options.region_params
         with Detector(classifier, search_params=search, region_params=regions) as detector:
             found = TrackTable.from_detections({key: detector.detect(image) for key, image in frames})
         scores = evaluate_detections(found, frames.labels, frames=frames.keys)
