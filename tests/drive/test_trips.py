@@ -5,11 +5,12 @@ import os
 from datetime import datetime, timedelta
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.video.clips import gray_frames, write_clip
 from vehicle_detection import InvalidInputError, open_trip
-from vehicle_detection.drive import find_trips
+from vehicle_detection.drive import find_trips, segment_clock
 from vehicle_detection.video import is_video_file
 
 
@@ -265,6 +266,21 @@ def test_the_segments_of_a_pattern_become_one_video_and_several_trips_are_listed
     message = r"2 trips \(front, 2 files from 20260131_081500_F.mp4; rear,"
     with pytest.raises(InvalidInputError, match=message):
         open_trip(card)
+
+
+def test_the_clock_of_the_camera_runs_on_while_it_pauses(card, tmp_path):
+    """Names hold whole seconds, so only a step of more than a second counts."""
+    clip = next(card.iterdir()).read_bytes()
+    for second in (0, 1, 4, 7, 8):  # of one second each
+        (tmp_path / f"20260131_08150{second}_F.mp4").write_bytes(clip)
+    with open_trip(tmp_path) as source:
+        assert source.info.duration == pytest.approx(5)
+        clock = segment_clock(source)
+    np.testing.assert_allclose(clock, [(0, 0), (2, 4), (3, 7)], atol=0.01)
+    with open_trip(next(tmp_path.iterdir())) as source:
+        assert segment_clock(source) == ((0.0, 0.0),)
+    with open_trip("test_images/*.jpg", fps=10) as source:
+        assert segment_clock(source) == ()
 
 
 def test_other_sources_are_those_of_open_source(card):

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
 
-from tests.helpers import StubDetector, start_interruptible
+from tests.helpers import ROOT, StubDetector, start_interruptible
 from tests.video.clips import NTSC, child_processes, ffmpeg, ffmpeg_log, gray_frames, write_clip
 from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video import probe_video, process_video, read_frames
@@ -219,6 +219,24 @@ def test_a_title_that_looks_like_a_part_of_the_log(tmp_path):
     path = write_clip(tmp_path / "clip.mp4", gray_frames(10), sound=True, options=title)
     info = probe_video(path)
     assert (info.frames, info.has_audio) == (10, True)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGCHLD")
+def test_a_failed_encoder_whose_exit_code_the_system_drops(clip, tmp_path):
+    """Files may not exceed 4 kB, so ffmpeg cannot write the video."""
+    code = (
+        "import resource, sys, vehicle_detection as vd; from tests.helpers import StubDetector;"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096));"
+        "vd.process_video(sys.argv[1], sys.argv[2], StubDetector(), progress=False)"
+    )
+    (tmp_path / "out.mp4").write_text("old")
+    ignored = "signal.signal(signal.SIGCHLD, signal.SIG_IGN); signal.signal(signal.SIGXFSZ, signal.SIG_IGN)"
+    start = f"import os, signal, sys; {ignored}; os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
+    command = [sys.executable, "-c", start, "-c", code, str(clip), str(tmp_path / "out.mp4")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "out.mp4 cannot be written: ffmpeg" in done.stderr
+    assert (tmp_path / "out.mp4").read_text() == "old"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGCHLD")

@@ -8,7 +8,6 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -16,7 +15,6 @@ from typing import Any
 
 from vehicle_detection import __version__
 from vehicle_detection._common import (
-    available_cores,
     check_path,
     check_sequence,
     describe,
@@ -26,7 +24,7 @@ from vehicle_detection._common import (
     local_path,
     stable_url,
 )
-from vehicle_detection.drive.trips import Trip, find_trips, probe_length
+from vehicle_detection.drive.trips import Trip, find_trips
 from vehicle_detection.errors import InvalidInputError, TransientVideoError
 from vehicle_detection.video import is_video_file, open_filesystem, walk_files, with_retries
 
@@ -114,13 +112,7 @@ def group_files(files: Sequence[str], group: str) -> list[Trip]:
     named = [file if is_url(file) else Path(file) for file in files]
     if group == "file":
         return [trip for file in named for trip in find_trips([file])]
-    # Which durations are needed does not depend on them, so they are probed at the same time.
-    needed: dict[Path | str, float] = {}
-    find_trips(named, duration=lambda file: needed.setdefault(file, 0.0))
-    with ThreadPoolExecutor(available_cores(), thread_name_prefix="vehicle-probe") as pool:
-        needed = dict(zip(needed, pool.map(probe_length, needed), strict=True))
-    # Others are needed if modification times have changed in the meantime.
-    return find_trips(named, duration=lambda file: needed[file] if file in needed else probe_length(file))
+    return find_trips(named)
 
 
 def trip_id(trip: Trip) -> str:

@@ -15,12 +15,13 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
-from vehicle_detection._common import check_sequence, describe, is_url, pluralize
+from vehicle_detection._common import available_cores, check_sequence, describe, is_url, pluralize
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.video import FrameSource, Source, is_video_file, list_files, open_source, probe_video
 
@@ -135,17 +136,21 @@ def find_trips(files: Iterable[File], *, duration: Callable[[File], float] | Non
         # Folders named after cameras are told apart by their path already.
         key = (str(name.parent), segment.camera, segment.series, segment.start is not None)
         groups[key].append((segment, file))
+    if duration is None:
+        probed = [file for members in groups.values() if len(members) > 1 for _, file in members]
+        with ThreadPoolExecutor(available_cores(), thread_name_prefix="vehicle-probe") as pool:
+            duration = dict(zip(probed, pool.map(_probe_length, probed), strict=True)).__getitem__
     trips = []
     for key in sorted(groups):
         members = sorted(
             groups[key],
             key=lambda pair: (pair[0].start or datetime.min, pair[0].number or 0, _posix(pair[1]).name),
         )
-        trips += _split(members, duration or probe_length)
+        trips += _split(members, duration)
     return trips
 
 
-def probe_length(file: File) -> float:
+def _probe_length(file: File) -> float:
     """Length of a video in seconds; 0 if it is unknown, as on storage from which it would be copied."""
     copied = is_url(str(file)) and not str(file).startswith(("http://", "https://"))
     try:
