@@ -91,6 +91,12 @@ class OwnSpeed:
                 f"speeds_mps must be at least 0, got {self.speeds_mps.min():g}; pass speeds, not velocities"
             )
         store_number(self, "max_gap", above=0)
+        clock = check_array(self.clock, "clock")
+        pairs = clock.ndim == 2 and clock.shape[1] == 2 and clock.dtype.kind in "iuf"
+        if clock.size and not (pairs and np.isfinite(clock).all()):
+            raise InvalidInputError(
+                f"clock must be pairs of seconds, got {describe(self.clock)}; pass what segment_clock returns"
+            )
 
     @classmethod
     def constant(cls, speed_mps: float) -> OwnSpeed:

@@ -21,7 +21,7 @@ from datetime import datetime
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
-from vehicle_detection._common import available_cores, check_sequence, describe, is_url, pluralize
+from vehicle_detection._common import available_cores, check_sequence, check_type, describe, is_url, pluralize
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.video import FrameSource, Source, is_video_file, list_files, open_source, probe_video
 
@@ -197,6 +197,7 @@ def segment_clock(source: FrameSource) -> tuple[tuple[float, float], ...]:
     Such as after pauses between segments; steps of up to a second are those of the names. Empty without times
     in the names.
     """
+    check_type(source, "source", FrameSource, "pass what open_trip returns")
     starts = [_parse_name(_posix(file)).start for file in source.files]
     clock, offset = list[tuple[float, float]](), 0.0
     for begin, start in zip(source.segment_starts, starts):
@@ -276,7 +277,7 @@ def _folder_camera(name: PurePosixPath) -> str:
 
 def _split(members: Sequence[tuple[_Segment, File]], duration: Callable[[File], float]) -> list[Trip]:
     """Split the sorted files of one camera where a segment does not follow the one before."""
-    trips, gaps = [[members[0]]], [None]
+    trips, gaps = [[members[0]]], list[float | None]([None])
     unclear = None
     for before, after in itertools.pairwise(members):
         gap = _find_gap(before, after, duration)
