@@ -24,6 +24,7 @@ from benchmarks import (
     _scaling,
     _search,
     _startup,
+    _truth,
     _video,
     _wrappers,
 )
@@ -41,6 +42,7 @@ BENCHMARKS: dict[str, Callable[[Context], list[Row]]] = {
     "drives": _drives.run,
     "lenses": _lenses.run,
     "cuts": _cuts.run,
+    "truth": _truth.run,
     "batch": _batch.run,
     "scaling": _scaling.run,
     "wrappers": _wrappers.run,
@@ -56,7 +58,7 @@ OUTPUT = Path(__file__).with_name("results.json")
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the named benchmarks, by default all but those on request."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS) + "; truth: folders")
     parser.add_argument(
         "--long", action="store_true", help="memory: also a run of 3,000 frames; batch: three rounds"
     )
@@ -65,11 +67,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--seeds", type=int, default=1, metavar="N", help="drives, lenses: drives of each kind"
     )
     parser.add_argument(
-        "--jobs", type=int, default=1, metavar="N", help="drives, lenses: number of processes"
+        "--jobs", type=int, default=1, metavar="N", help="drives, lenses, truth: number of processes"
     )
+    parser.add_argument("--fps", type=float, metavar="N", help="truth: frame rate of the sequences")
     parser.add_argument("--compare", metavar="REF", help="only compare the speed with another commit's")
     parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FILE", help="the JSON file to write")
     options = parser.parse_args(arguments)
+    sequences = [Path(name) for name in options.names if name not in BENCHMARKS and Path(name).is_dir()]
+    if sequences:
+        options.names = ["truth"]
     unknown = sorted(set(options.names) - set(BENCHMARKS))
     if unknown:
         parser.error(f"no benchmark {unknown[0]!r}; choose from {', '.join(BENCHMARKS)}")
@@ -84,7 +90,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     results = {}
     with tempfile.TemporaryDirectory(prefix="benchmarks") as work:
         context = Context(
-            Path(work), plots=options.plots, long=options.long, seeds=options.seeds, jobs=options.jobs
+            Path(work),
+            plots=options.plots,
+            long=options.long,
+            seeds=options.seeds,
+            jobs=options.jobs,
+            sequences=sequences,
+            fps=options.fps,
         )
         if options.compare:
             print_table({"compare": _compare.compare(context, options.compare)}, console)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,6 +47,7 @@ class Context:
     """Options of a run: a temporary folder, a folder for plots, whether to measure longer, and seeds.
 
     `seeds` is the number of drives of each kind, and `jobs` the number of processes that track them.
+    `sequences` are folders with measured distances, and `fps` is their frame rate.
     """
 
     work: Path
@@ -54,6 +55,8 @@ class Context:
     long: bool = False
     seeds: int = 1
     jobs: int = 1
+    sequences: Sequence[Path] = ()
+    fps: float | None = None
 
 
 def data_folder() -> Path | None:

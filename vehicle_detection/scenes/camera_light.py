@@ -114,6 +114,7 @@ class SceneConfig:
     rain: float = 0.0  # 0 (dry) to 1 (heavy)
     jpeg_quality: int | None = None  # None: the images are not compressed
     margin: int = 0  # rows drawn above and below the frame, for a camera that pitches
+    roll: float = 0.0  # rows by which the image falls per column to the right of the middle
     seed: int = 0
 
     @property
@@ -129,9 +130,14 @@ class SceneConfig:
         rows = camera.horizon_px + camera.focal_px * (camera.height_m - up) / ahead
         return np.stack([columns, rows], axis=-1)
 
-    def pitched(self, offset: int) -> SceneConfig:
-        """Return the configuration with the horizon `offset` rows lower."""
-        return replace(self, camera=replace(self.camera, horizon_px=self.camera.horizon_px + offset))
+    def pitched(self, offset: float, roll: float = 0.0) -> SceneConfig:
+        """Return the configuration with the horizon `offset` rows lower, and rolled."""
+        camera = replace(self.camera, horizon_px=self.camera.horizon_px + offset)
+        return replace(self, camera=camera, roll=roll)
+
+    def on_hill(self, slope: float) -> SceneConfig:
+        """Return the configuration for a vehicle that a hill lifts by `slope` times its distance."""
+        return self.pitched(-slope * self.camera.focal_px, self.roll) if slope else self
 
 
 def _check_shape(shape: object, name: str) -> tuple[int, int]:

@@ -6,13 +6,13 @@ import csv
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from vehicle_detection._common import atomic_write, check_choice, check_integer, check_number
+from vehicle_detection._common import atomic_write, check_bool, check_choice, check_integer, check_number
 from vehicle_detection.scenes.bodywork import VehicleBody
 from vehicle_detection.scenes.camera_light import SceneConfig, SceneView
 from vehicle_detection.scenes.raster import Rng
@@ -25,6 +25,10 @@ from vehicle_detection.tables import FrameKey, TrackTable
 SCENARIOS = (
     "highway", "overtaking", "crossing", "occlusion", "traffic", "passing", "closing", "cut_in", "empty",
 )  # fmt: skip
+
+# Of rough drives: largest pitch and roll of the camera (radians), curvature of the road (1/m) and the time
+# (s) between two crests, and fraction of trucks.
+_PITCH, _ROLL, _CURVATURE, _CREST_TIME, _TRUCKS = 0.005, 0.013, 1 / 4000, 7.0, 0.1
 
 # Columns of a labels file; the first nine are those of manual labels.
 LABEL_COLUMNS = (
@@ -51,6 +55,7 @@ class TrafficVehicle:
     change_at: float = 0.0  # middle and duration of the lane change (s)
     change_for: float = 5.0
     oncoming: bool = False
+    widening: float = 1.0  # width over that of its kind
 
     def distance(self, time: float) -> float:
         """Distance from the camera to the nearer tires (m)."""
@@ -175,12 +180,24 @@ class Drive:
     """A drive made by `render_drive`; ``drive[i]`` and iteration render `Scene` objects, and none is kept."""
 
     def __init__(
-        self, config: SceneConfig, road: Road, traffic: Sequence[TrafficVehicle], *, frames: int, fps: float
+        self,
+        config: SceneConfig,
+        road: Road,
+        traffic: Sequence[TrafficVehicle],
+        *,
+        frames: int,
+        fps: float,
+        rough: bool = False,
     ) -> None:
         self.fps, self.shape = fps, config.shape
         self._frames, self._renderer = frames, SceneRenderer(config, road)
-        self._traffic = [(v, VehicleBody(v.kind, v.color, v.seed, v.view, config.light)) for v in traffic]
-        self._pitch_phases = np.random.default_rng([config.seed, 8]).uniform(0, 2 * np.pi, 3)
+        self._traffic = [
+            (v, VehicleBody(v.kind, v.color, v.seed, v.view, config.light, v.widening)) for v in traffic
+        ]
+        rng = np.random.default_rng([config.seed, 8])
+        self._pitch_phases = rng.uniform(0, 2 * np.pi, 3)
+        self._roll = _ROLL * rng.uniform(-1, 1) if rough else 0.0
+        self._curvature = _CURVATURE if rough else 0.0
 
     def __repr__(self) -> str:
         height, width = self.shape[:2]
@@ -215,17 +232,23 @@ class Drive:
         """Ground truth of frame `index`, computed without rendering the image."""
         return self._renderer.truth(*self._state(self._check_index(index)))
 
-    def _state(self, frame: int) -> tuple[list[VehiclePose], float, int]:
-        """Poses of the vehicles that may be visible, distance traveled (m) and pitch offset (rows)."""
+    def _state(self, frame: int) -> tuple[list[VehiclePose], float, int, float]:
+        """Poses of the vehicles that may be visible, distance traveled (m), pitch offset (rows) and roll."""
         time = frame / self.fps
+        waves = np.sin(2 * np.pi * frame / self.fps * np.array([1.3, 2.1, 3.7]) + self._pitch_phases)
+        # The road rises or falls from below the camera on as a parabola.
+        bend = self._curvature * math.sin(2 * math.pi * time / _CREST_TIME + self._pitch_phases[0])
         poses = [
-            VehiclePose(body, v.track, v.lateral(time), v.distance(time), v.relative_speed(time), v.oncoming)
+            VehiclePose(
+                body, v.track, v.lateral(time), v.distance(time), v.relative_speed(time), v.oncoming,
+                bend / 2 * v.distance(time),
+            )
             for v, body in self._traffic
             if -12.0 < v.distance(time) < 230.0
-        ]
-        waves = np.sin(2 * np.pi * frame / self.fps * np.array([1.3, 2.1, 3.7]) + self._pitch_phases)
+        ]  # fmt: skip
         pitch_offset = int(np.rint(self._renderer.config.margin * float(waves @ (0.5, 0.3, 0.2))))
-        return poses, 27.0 * time, pitch_offset  # the speed of the camera is 27 m/s
+        # The speed of the camera is 27 m/s.
+        return poses, 27.0 * time, pitch_offset, self._roll * (1 + 0.4 * float(waves[1]))
 
     def write_labels(self, path: str | os.PathLike[str]) -> None:
         """Write the ground truth of every frame as CSV; see `write_labels`."""
@@ -238,6 +261,7 @@ def render_drive(
     fps: float = 25.0,
     scenario: str = "highway",
     pitch_jitter_px: int = 0,
+    rough: bool = False,
     random_state: RandomState = 0,
     **view: Any,
 ) -> Drive:
@@ -257,6 +281,10 @@ def render_drive(
         ``"cut_in"``: a car moves into the lane of the camera. ``"empty"``: no vehicles.
     pitch_jitter_px
         Largest number of rows by which the pitch of the camera moves the horizon up or down.
+    rough
+        Whether vehicles are 1.5 to 2.6 m wide, with trucks among them, the camera rolls by up to a degree,
+        and pitches by up to 0.3 without `pitch_jitter_px`, and the vehicles follow crests and dips of a
+        radius of 4 km; the surface of the road is drawn level.
     random_state, **view
         As for `render_scene`.
 
@@ -271,8 +299,20 @@ def render_drive(
     fps = check_number(fps, "fps", low=1.0, high=1000.0)
     check_choice(scenario, "scenario", SCENARIOS)
     margin = check_integer(pitch_jitter_px, "pitch_jitter_px", low=0, high=50)
+    rough = check_bool(rough, "rough")
     config = SceneView(**view).configure(rng, margin)
-    return Drive(config, *make_traffic(scenario, frames / fps, rng), frames=frames, fps=fps)
+    road, traffic = make_traffic(scenario, frames / fps, rng)
+    if rough:
+        margin = margin or math.ceil(_PITCH * config.camera.focal_px)
+        config = replace(config, margin=margin)
+        traffic = [_vary(vehicle, rng) for vehicle in traffic]
+    return Drive(config, road, traffic, frames=frames, fps=fps, rough=rough)
+
+
+def _vary(vehicle: TrafficVehicle, rng: Rng) -> TrafficVehicle:
+    """Return the vehicle with another width, some of them as trucks."""
+    kind = "truck" if rng.random() < _TRUCKS else vehicle.kind
+    return replace(vehicle, kind=kind, widening=rng.uniform(0.88, 1.05))
 
 
 def truth_table(frames: Mapping[FrameKey, Sequence[VehicleTruth]]) -> TrackTable:

@@ -58,6 +58,7 @@ class VehiclePose:
     distance: float  # to its nearer tires (m)
     speed: float = 0.0  # away from the camera (m/s)
     oncoming: bool = False
+    slope: float = 0.0  # height of the road below it over that below the camera, over its distance
 
     @property
     def start(self) -> float:
@@ -105,13 +106,13 @@ def composite(
     for oncoming in (True, False):
         group = [pose for pose in poses if pose.oncoming == oncoming]
         for pose in sorted(group, key=lambda pose: -pose.distance):
-            sprite = draw_vehicle(image, config, pose)
+            sprite = draw_vehicle(image, config.on_hill(pose.slope), pose)
             if sprite is not None:
                 instance_map[sprite.region][sprite.solid] = pose.track
                 drawn.append((pose, sprite))
         if oncoming:
             scenery.draw_barrier(canvas, travel)
-    truth = (ground_truth(pose, sprite, instance_map, config) for pose, sprite in drawn)
+    truth = (ground_truth(pose, sprite, instance_map, config.on_hill(pose.slope)) for pose, sprite in drawn)
     return tuple(sorted(truth, key=lambda row: row.track)), instance_map
 
 
@@ -132,16 +133,34 @@ def ground_truth(
     box = np.array(sprite.box, np.float64)
     full = np.where(box == (0, 0, width, height), projected_box(pose, config), box)
     full = np.concatenate([np.minimum(full[:2], box[:2]), np.maximum(full[2:], box[2:])])
+    if config.roll:
+        box, full = _rolled_boxes(sprite, box, full, config)
     x1, y1, x2, y2 = full.tolist()
     truncated = 1 - float((box[2] - box[0]) * (box[3] - box[1])) / ((x2 - x1) * (y2 - y1))
     visible = instance_map[sprite.region][sprite.solid] == pose.track
     fraction = 1 - np.count_nonzero(visible) / visible.size
     occluded = 2 if fraction > 0.5 else 1 if fraction >= 0.1 else 0
     truth = VehicleTruth(
-        pose.track, sprite.box, (x1, y1, x2, y2), pose.start, pose.speed, fraction, occluded, truncated,
-        ignore=int(pose.oncoming),
+        pose.track, tuple(map(int, box)), (x1, y1, x2, y2), pose.start, pose.speed, fraction, occluded,
+        truncated, ignore=int(pose.oncoming),
     )  # fmt: skip
     return replace(truth, ignore=1) if truth.hard_to_see else truth
+
+
+def _rolled_boxes(
+    sprite: Sprite, box: Doubles, full: Doubles, config: SceneConfig
+) -> tuple[Doubles, Doubles]:
+    """Box of a vehicle's pixels, and of those inside the frame or not, after the image is rolled."""
+    columns = np.flatnonzero(sprite.solid.any(axis=0))
+    solid = sprite.solid[:, columns]
+    fall = config.roll * (sprite.left + columns + 0.5 - config.center_px)
+    top = sprite.top + solid.argmax(axis=0) + fall
+    bottom = sprite.top + len(solid) - solid[::-1].argmax(axis=0) + fall
+    inside = np.clip(np.rint([top.min(), bottom.max()]), 0, config.shape[0])
+    first, last = full[[1, 3]] + (top.min() - box[1], bottom.max() - box[3])
+    rolled = np.array([box[0], inside[0], box[2], inside[1]])
+    around = np.where(rolled == (0, 0, *config.shape[::-1]), (full[0], first, full[2], last), rolled)
+    return rolled, np.concatenate([np.minimum(around[:2], rolled[:2]), np.maximum(around[2:], rolled[2:])])
 
 
 def projected_box(pose: VehiclePose, config: SceneConfig) -> Doubles:

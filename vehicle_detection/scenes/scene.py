@@ -75,12 +75,21 @@ class SceneRenderer:
         """The sensor of the camera."""
         return Sensor(self.config)
 
-    def scene(self, poses: Sequence[VehiclePose], travel: float, pitch_offset: int, frame: int) -> Scene:
+    def scene(
+        self, poses: Sequence[VehiclePose], travel: float, pitch_offset: int, roll: float, frame: int
+    ) -> Scene:
         """Render a scene `travel` meters into the drive, with the horizon `pitch_offset` rows lower."""
-        config = self.config.pitched(pitch_offset)
+        config = self.config.pitched(pitch_offset, roll)
         first = config.margin - pitch_offset
         image = np.ascontiguousarray(self.scenery.render(travel)[first : first + config.shape[0]])
         truth, instance_map = composite(poses, self.scenery, config, travel, image)
+        if roll:
+            # For small angles, a rotation moves each column down or up.
+            shear = np.array([[1, 0, 0], [roll, 1, -roll * config.center_px]])
+            size, border = (config.shape[1], config.shape[0]), cv2.BORDER_REFLECT
+            image = np.asarray(cv2.warpAffine(image, shear, size, borderMode=border), np.uint8)
+            tracks = instance_map.astype(np.float32)
+            instance_map = cv2.warpAffine(tracks, shear, size, flags=cv2.INTER_NEAREST).astype(np.int32)
         image = self.sensor.expose(image, frame)
         if config.jpeg_quality is not None:
             bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
@@ -89,10 +98,10 @@ class SceneRenderer:
         return Scene(image, truth, config.camera, instance_map)
 
     def truth(
-        self, poses: Sequence[VehiclePose], travel: float, pitch_offset: int
+        self, poses: Sequence[VehiclePose], travel: float, pitch_offset: int, roll: float
     ) -> tuple[VehicleTruth, ...]:
         """Ground truth of the same scene without the image."""
-        return composite(poses, self.scenery, self.config.pitched(pitch_offset), travel, None)[0]
+        return composite(poses, self.scenery, self.config.pitched(pitch_offset, roll), travel, None)[0]
 
 
 def render_scene(
@@ -148,7 +157,7 @@ def render_scene(
         lateral, distance = float(vehicle.lateral_m), float(vehicle.distance_m)
         poses.append(VehiclePose(body, track, lateral, distance, float(vehicle.speed_mps)))
     travel = np.random.default_rng([config.seed, 6]).uniform(0, 200)
-    return SceneRenderer(config, road).scene(poses, travel, pitch_offset=0, frame=0)
+    return SceneRenderer(config, road).scene(poses, travel, pitch_offset=0, roll=0.0, frame=0)
 
 
 def _random_vehicles(road: Road, count: int, rng: Rng) -> list[SceneVehicle]:

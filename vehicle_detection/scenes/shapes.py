@@ -35,10 +35,11 @@ class VehicleShape:
     corner: float = 0.32  # depth of the rounded corners
     is_box: bool = False  # a box truck
 
-    def scaled(self, factor: float) -> VehicleShape:
-        """Return the same vehicle, `factor` times as large."""
+    def scaled(self, factor: float, widening: float = 1.0) -> VehicleShape:
+        """Return the same vehicle, `factor` times as large, and `widening` times as wide as that."""
         lengths = set(self.__dataclass_fields__) - {"roof", "is_box"}
-        return replace(self, **{name: np.multiply(getattr(self, name), factor).tolist() for name in lengths})
+        sizes = {name: np.multiply(getattr(self, name), factor).tolist() for name in lengths}
+        return replace(self, **sizes | {"width": sizes["width"] * widening})
 
 
 _FILE = importlib.resources.files("vehicle_detection.scenes") / "vehicle_shapes.json"
@@ -103,9 +104,11 @@ class VehicleAppearance:
 class BodyShape:
     """Shape, color and details of one vehicle; `view` is the end that the camera sees, rear or front."""
 
-    def __init__(self, kind: str, color: str, seed: int, view: str, light: Light) -> None:
+    def __init__(
+        self, kind: str, color: str, seed: int, view: str, light: Light, widening: float = 1.0
+    ) -> None:
         rng = np.random.default_rng([seed, 7])
-        dims = VEHICLE_SHAPES[kind].scaled(rng.uniform(0.96, 1.05))
+        dims = VEHICLE_SHAPES[kind].scaled(rng.uniform(0.96, 1.05), widening)
         self.dimensions, self.view, self.light = dims, view, light
         rear = view == "rear"
         self.end, self.far_end = (dims.rear, dims.front) if rear else (dims.front, dims.rear)
