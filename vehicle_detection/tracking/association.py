@@ -20,9 +20,9 @@ _COVER_MARGIN = 0.03
 # Fraction of a vehicle's height by which the bottom edge of a nearer one is lower.
 _MIN_NEARER = 0.1
 # A nearer vehicle hides a left or right edge if it shares this fraction of the height, and covers the point
-# at this distance beyond the edge, as a fraction of the height.
-_MIN_SHARED_HEIGHT = 0.5
-_HIDING_DISTANCE = 0.06
+# at this distance beyond the edge, as a fraction of the height; or the bottom edge with this fraction of the
+# width.
+_MIN_SHARED_HEIGHT, _HIDING_DISTANCE, _MIN_SHARED_WIDTH = 0.5, 0.06, 0.6
 # Largest growth of an approaching vehicle between two searched frames.
 _MAX_GROWTH = 1.6
 # Smallest IoU of its grown box with the new one.
@@ -112,7 +112,8 @@ def _are_nearer(boxes: Floats, others: Floats) -> Bools:
 def hidden_edges(boxes: Floats, tracked: Floats, rows: Sequence[int], is_opaque: Bools) -> Bools:
     """``(N, 4)``: whether a nearer, opaque one of the `tracked` boxes hides what lies beyond an edge.
 
-    `boxes` are of the tracks `rows`. Only left and right edges are marked: vehicles pass each other sideways.
+    `boxes` are of the tracks `rows`. The top edge is never marked, and the bottom edge only where a vehicle
+    hides most of it, as vehicles pass each other sideways.
     """
     heights = (boxes[:, 3] - boxes[:, 1])[:, None]
     shared = np.minimum(boxes[:, None, 3], tracked[:, 3]) - np.maximum(boxes[:, None, 1], tracked[:, 1])
@@ -122,6 +123,10 @@ def hidden_edges(boxes: Floats, tracked: Floats, rows: Sequence[int], is_opaque:
     for edge, outward in (0, -1), (2, 1):
         x = boxes[:, edge, None] + outward * _HIDING_DISTANCE * heights
         hidden[:, edge] = (hiding & (tracked[:, 0] < x) & (x < tracked[:, 2])).any(axis=1)
+    y, widths = boxes[:, 3, None] + _HIDING_DISTANCE * heights, (boxes[:, 2] - boxes[:, 0])[:, None]
+    across = np.minimum(boxes[:, None, 2], tracked[:, 2]) - np.maximum(boxes[:, None, 0], tracked[:, 0])
+    below = others & is_opaque & _are_nearer(boxes, tracked) & (tracked[:, 1] < y)
+    hidden[:, 3] = (below & (across > _MIN_SHARED_WIDTH * widths)).any(axis=1)
     return hidden
 
 

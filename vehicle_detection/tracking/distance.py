@@ -1,44 +1,58 @@
 """Extended Kalman filter of the distances of many tracks at once.
 
-The state of a distance is ``[distance in m, speed in m/s, log(width / camera.vehicle_width_m), length error
-in m]``. Width and length are part of the state: a truck seems near by its width until its bottom edge has
-corrected it, and from then on its growth in the image gives the speed. The length matters where the side of
-a vehicle is visible, and its error is relative to ``camera.vehicle_length_m``. In names, "range" is the
-distance with this state. The distance is that of the vehicle's nearest part; its box ends at its tires,
-``camera.overhang_m`` behind that.
+The state of a distance is what a box's edges depend on (`DISTANCE` to `HEIGHT`): distance in m, speed in m/s,
+log(width / camera.vehicle_width_m), error in m of camera.vehicle_length_m, error of the horizon in px,
+log(height of the camera above the road there / camera.height_m) and log(height / camera.vehicle_height_m).
+A truck seems near by its width until its bottom edge has corrected it, and from then on its growth in the
+image gives the speed. The length matters where the side of a vehicle is visible. Errors that successive
+frames share (pitch, hills, sizes) are states, because as noise they would average out (Bar-Shalom, Li and
+Kirubarajan, *Estimation with Applications to Tracking and Navigation*, section 8.2).
+
+In names, "range" is the distance with this state. The distance is that of the vehicle's nearest part; its
+box ends at its tires, ``camera.overhang_m`` behind that.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from vehicle_detection._common import Floats
 from vehicle_detection.camera import Camera
-from vehicle_detection.tracking.kalman import KalmanStates, Measurements
+from vehicle_detection.tracking.kalman import Bools, KalmanStates, Measurements
+
+DISTANCE, SPEED, WIDTH, LENGTH, HORIZON, CAMERA_HEIGHT, HEIGHT = range(7)
+"""Columns of a state."""
 
 _INITIAL_DISTANCE, _INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD = 30.0, 1e3, 40.0
 _MIN_DISTANCE, _MAX_DISTANCE = 1.0, 500.0
 # Least and greatest values of a state.
-_LIMITS = np.array([[_MIN_DISTANCE, -np.inf, -0.7, -3.0], [_MAX_DISTANCE, np.inf, 0.9, 8.0]])
+_LIMITS = np.array(
+    [
+        [_MIN_DISTANCE, -np.inf, -0.7, -3.0, -np.inf, -0.5, -1.5],
+        [_MAX_DISTANCE, np.inf, 0.9, 8.0, np.inf, 0.5, 1.5],
+    ]
+)
 # Process noise of the speed (m/s per square root of a second).
 _ACCELERATION = 1.5
-# Times (s) in which the width's prior variance is added to its process noise, and over which errors that
-# successive frames share (pitch, hills, how much of a side is seen) are correlated.
-_WIDTH_TIME, _SYSTEMATIC_TIME = 20.0, 2.0
+# Prior error of the height's logarithm, so large that only its growth counts, and its process noise.
+_HEIGHT_STD, _HEIGHT_CHANGE = 1.0, 0.1
+# Times (s) in which the width's prior variance is added to its process noise, and over which the error of the
+# horizon (pitch and hills), and other errors that successive frames share, are correlated.
+_WIDTH_TIME, _PITCH_TIME, _SHARED_TIME = 20.0, 1.0, 2.0
 # Mean innovation of an edge (standard errors) above which a distance is uncertain, and the relative error
 # that it then gains (per square root of a second).
-_UNSETTLED, _UNSETTLED_STD = 1.5, 0.5
+_UNSETTLED, _UNSETTLED_STD = 2.0, 0.5
+# Standard errors by which a box grows faster or slower than its speed says, above which the speed is another
+# vehicle's, and time (s) in which it is forgotten.
+_OTHER_SPEED, _FORGET_TIME = 2.5, 0.2
 # Maximum relative error of a reported distance, without that of the focal length; maximum age of its last
-# measurement (s), and error of a speed (m/s). A distance that is too small makes the speed and its error too
-# small alike, so such vehicles pass the last limit first: stated speeds near -40 m/s are biased towards 0 by
-# about one standard error.
-_MAX_RANGE_STD, _MAX_RANGE_AGE, _MAX_RANGE_SPEED_STD = 0.4, 0.5, 6.0
-# Fraction of a box that nearer vehicles cover, from which on it is no measurement, and relative error of the
-# width of a box that they cover less.
-_MAX_COVERED, _COVERED_STD = 0.3, 0.15
+# measurement (s); and error of a reported speed: in m/s, or as a fraction of it, whichever is larger.
+_MAX_RANGE_STD, _MAX_RANGE_AGE, _MAX_RANGE_SPEED_STD, _MAX_SPEED_ERROR = 0.4, 0.5, 6.0, 0.25
+# Relative error of the width of a box that nearer vehicles partly cover.
+_COVERED_STD = 0.15
 # Vehicles in another lane that approach fast are mostly oncoming, and a barrier may hide their wheels:
 # minimum speed (m/s), length (m) of the side that their boxes lack, and relative error of the bottom edge.
 _ONCOMING_SPEED, _ONCOMING_CUT, _ONCOMING_BOTTOM_STD = 15.0, 1.0, 0.3
@@ -57,117 +71,209 @@ _MAX_ASPECT = 1.5
 
 def initiate_states(mean: Floats, cov: Floats, camera: Camera) -> KalmanStates:
     """Return the states of new tracks, whose distance is unknown, from those of their boxes."""
-    count, width_std = (
-        len(mean),
-        math.hypot(camera.vehicle_width_std_m, camera.mean_width_std_m) / camera.vehicle_width_m,
-    )
-    length_std = camera.vehicle_length_std_m
-    range_std = np.array([_INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD, width_std, length_std])
-    range_mean = np.tile([_INITIAL_DISTANCE, 0.0, 0.0, 0.0], (count, 1))
-    range_cov = np.tile(np.diag(np.square(range_std)), (count, 1, 1))
+    count = len(mean)
+    std = np.empty(7)
+    std[[DISTANCE, SPEED]] = _INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD
+    std[WIDTH] = math.hypot(camera.vehicle_width_std_m, camera.mean_width_std_m) / camera.vehicle_width_m
+    std[LENGTH], std[HEIGHT] = camera.vehicle_length_std_m, _HEIGHT_STD
+    std[HORIZON], std[CAMERA_HEIGHT] = camera.total_horizon_std_px, camera.height_std_m / camera.height_m
+    range_mean = np.zeros((count, 7))
+    range_mean[:, DISTANCE] = _INITIAL_DISTANCE
+    range_cov = np.tile(np.diag(np.square(std)), (count, 1, 1))
     return KalmanStates(mean, cov, np.zeros((count, 4)), range_mean, range_cov)
 
 
 def predict_distances(states: KalmanStates, dt: float, camera: Camera) -> KalmanStates:
     """Predict distances by `dt` seconds."""
-    transition = np.eye(4)
-    transition[0, 1] = dt
+    transition, noise = np.eye(7), np.zeros((7, 7))
+    transition[DISTANCE, SPEED] = dt
+    # The error of the horizon returns to 0 (Gauss-Markov process).
+    transition[HORIZON, HORIZON] = math.exp(-dt / _PITCH_TIME)
     mean = states.range_mean @ transition.T
-    mean[:, 0] = np.clip(mean[:, 0], _MIN_DISTANCE, _MAX_DISTANCE)
-    noise = np.zeros((4, 4))
+    mean[:, DISTANCE] = np.clip(mean[:, DISTANCE], _MIN_DISTANCE, _MAX_DISTANCE)
     noise[:2, :2] = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]) * _ACCELERATION**2
-    noise[2, 2] = (camera.vehicle_width_std_m / camera.vehicle_width_m) ** 2 * dt / _WIDTH_TIME
+    noise[WIDTH, WIDTH] = (camera.vehicle_width_std_m / camera.vehicle_width_m) ** 2 * dt / _WIDTH_TIME
+    noise[HEIGHT, HEIGHT] = _HEIGHT_CHANGE**2 * dt / _WIDTH_TIME
+    noise[HORIZON, HORIZON] = camera.total_horizon_std_px**2 * (1 - math.exp(-2 * dt / _PITCH_TIME))
     return states._replace(range_mean=mean, range_cov=transition @ states.range_cov @ transition.T + noise)
+
+
+class _View(NamedTuple):
+    """What the boxes of a frame show, as columns with one row per track."""
+
+    below_horizon: Floats  # pixels from the horizon to the bottom edge
+    sides: Floats  # (N, 2) width and height in pixels
+    edge_std: Floats  # (N, 2) error of the left and right edges, and of the top and bottom edges
+    lateral_px: Floats
+    width_scale: Floats  # width in pixels times the distance
+    tallness: Floats  # height over the width of the near face, relative to a car's
+    oncoming: Bools
+    sees_bottom: Bools  # which of them are measurements
+    sees_width: Bools
+    sees_height: Bools
+    is_bound: Bools  # whether the width is only a lower bound
+    box_frames: float  # frames that share the error of a box, and other errors
+    shared_frames: float
 
 
 def update_distances(
     states: KalmanStates, measured: Measurements, camera: Camera, dt: float, correlation_time: float
 ) -> KalmanStates:
-    """Correct distances by the bottom edge and the width of boxes (extended Kalman filter).
+    """Correct distances by the bottom edge, the width and the height of boxes (extended Kalman filter).
 
     The errors of a vehicle's boxes are correlated over `correlation_time` seconds.
     """
     mean, cov = states.range_mean.copy(), states.range_cov.copy()
-    # While the edges of a box have not settled, or are partly covered, its distance is uncertain.
-    unsettled = (np.abs(states.innovation_mean) > _UNSETTLED).any(axis=1)
-    unsettled |= measured.covered > 0
-    cov[:, 0, 0] += unsettled * np.square(_UNSETTLED_STD * mean[:, 0]) * dt
-    # A merged box shows neither the bottom nor the width of its vehicles.
-    visible = ~(measured.truncated | measured.merged[:, None])  # left, top, right, bottom
-    visible &= (measured.covered < _MAX_COVERED)[:, None]
-    bottom_visible, width_visible = visible[:, 3], visible[:, 0] & visible[:, 2]
-    # Behind a nearer vehicle a box ends where its visible part does, and grows as its vehicle emerges: its
-    # width is only a lower bound, as in a Kalman filter of censored measurements (Allik et al., *IEEE
-    # Transactions on Control Systems Technology*, 2016).
-    is_bound = measured.hidden[:, [0, 2]].any(axis=1)
+    _loosen(mean, cov, states, measured, dt)
+    view = _view(mean, measured, camera, dt, correlation_time)
+    view = _start(mean, cov, view, camera)
+    mean, cov = _correct_by_bottom(mean, cov, view, camera)
+    np.clip(mean[:, DISTANCE], _MIN_DISTANCE, _MAX_DISTANCE, out=mean[:, DISTANCE])
+    mean, cov = _correct_by_width(mean, cov, view, measured, camera)
+    np.clip(mean[:, DISTANCE], _MIN_DISTANCE, _MAX_DISTANCE, out=mean[:, DISTANCE])
+    mean, cov = _correct_by_height(mean, cov, view, camera)
+    return states._replace(range_mean=np.clip(mean, *_LIMITS), range_cov=cov)
+
+
+def _loosen(mean: Floats, cov: Floats, states: KalmanStates, measured: Measurements, dt: float) -> None:
+    """Increase the errors of distances and speeds that the boxes contradict, in place."""
+    # While the edges of a box have not settled, or a nearer vehicle hides the bottom edge.
+    unsettled = (np.abs(states.innovation_mean) > _UNSETTLED).any(axis=1) | measured.hidden[:, 3]
+    cov[:, DISTANCE, DISTANCE] += unsettled * np.square(_UNSETTLED_STD * mean[:, DISTANCE]) * dt
+    # The height of a box grows at the rate -speed / distance, unless the track has gone over to a vehicle
+    # with another speed.
+    height, distance = states.mean[:, 3], mean[:, DISTANCE]
+    misfit = states.mean[:, 7] / height + mean[:, SPEED] / distance
+    misfit_std = np.hypot(np.sqrt(states.cov[:, 7, 7]) / height, np.sqrt(cov[:, SPEED, SPEED]) / distance)
+    other = (np.abs(misfit) > _OTHER_SPEED * misfit_std) & ~measured.truncated.any(axis=1)
+    cov[:, SPEED, SPEED] += other * np.square(misfit * distance) * min(dt / _FORGET_TIME, 1.0)
+
+
+def _view(mean: Floats, measured: Measurements, camera: Camera, dt: float, correlation_time: float) -> _View:
     boxes, lateral_px = measured.road_boxes, measured.lateral_px
     sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
-    # (N, 2): the left and right edges, and the top and bottom edges, in pixels.
-    edge_std = np.hypot(camera.bottom_std_px * camera.pixel_scale, camera.box_std * sides)
-    horizon_std = camera.total_horizon_std_px
-    # An error that n frames share must not average out among them: its variance is multiplied by n.
-    box_frames, shared_frames = max(1.0, correlation_time / dt), max(1.0, _SYSTEMATIC_TIME / dt)
-    below_horizon = boxes[:, 3] - camera.horizon_px
-
-    bottom_scale = camera.focal_px * camera.height_m
-    oncoming = (mean[:, 1] < -_ONCOMING_SPEED) & (lateral_px > 0)
+    oncoming = (mean[:, SPEED] < -_ONCOMING_SPEED) & (lateral_px > 0)
     width_scale = camera.width_times_distance(lateral_px) - oncoming * _ONCOMING_CUT * lateral_px
-    # Height of a box over the part of its width that shows the near face, relative to that of a car.
     tallness = sides[:, 1] / sides[:, 0] * width_scale / (camera.focal_px * camera.vehicle_height_m)
-    # The width of a vehicle that crosses the road, or stands across it, is its length.
-    width_visible &= tallness > _MIN_TALLNESS
-    unknown = cov[:, 0, 0] > _INITIAL_DISTANCE_STD**2 / 2
-    if unknown.any():
-        whole = width_visible & ~is_bound
-        # Linearize at the first measurement itself.
-        below = bottom_visible & (below_horizon > 2 * np.hypot(edge_std[:, 1], horizon_std))
-        by_bottom = bottom_scale / np.where(below, below_horizon, 1.0) - camera.overhang_m
-        # The measurement with the smaller relative error.
-        bottom_error = np.hypot(edge_std[:, 1], horizon_std) / np.where(below, below_horizon, 1.0)
-        width_error = np.sqrt(cov[:, 2, 2] + np.square(lateral_px / width_scale) * cov[:, 3, 3])
-        is_better = below & ((bottom_error < width_error) | ~whole)
-        known = unknown & (below | whole)
-        # Tall vehicles are wide: vans, buses and trucks.
-        tall = np.clip(_WIDTH_OF_HEIGHT * (tallness - _TALL), 0.0, _MAX_TALL_WIDTH)
-        mean[:, 2] = np.where(known & whole, tall, mean[:, 2])
-        first = np.where(is_better, by_bottom, width_scale * np.exp(mean[:, 2]) / sides[:, 0])
-        mean[known, 0] = np.clip(first[known], _MIN_DISTANCE, _MAX_DISTANCE)
-        bottom_visible &= is_better | ~unknown
+    # A merged box shows neither the bottom nor the width of its vehicles.
+    visible = ~(measured.truncated | measured.merged[:, None])  # left, top, right, bottom
+    visible[:, 3] &= ~measured.hidden[:, 3]
+    return _View(
+        below_horizon=boxes[:, 3] - camera.horizon_px - mean[:, HORIZON],
+        sides=sides,
+        edge_std=np.hypot(camera.bottom_std_px * camera.pixel_scale, camera.box_std * sides),
+        lateral_px=lateral_px,
+        width_scale=width_scale,
+        tallness=tallness,
+        oncoming=oncoming,
+        sees_bottom=visible[:, 3],
+        # The width of a vehicle that crosses the road, or stands across it, is its length.
+        sees_width=visible[:, 0] & visible[:, 2] & (tallness > _MIN_TALLNESS),
+        # A vehicle that the frame's side cuts shows the height of its far end.
+        sees_height=visible.all(axis=1),
+        # Behind a nearer vehicle a box ends where its visible part does, and grows as its vehicle emerges:
+        # its width is only a lower bound, as in a Kalman filter of censored measurements (Allik et al., *IEEE
+        # Transactions on Control Systems Technology*, 2016).
+        is_bound=measured.hidden[:, [0, 2]].any(axis=1),
+        # An error that n frames share must not average out among them: its variance is multiplied by n.
+        box_frames=max(1.0, correlation_time / dt),
+        shared_frames=max(1.0, _SHARED_TIME / dt),
+    )
 
-    # The measurement is z = log(below_horizon), the model h(x) = log(bottom_scale / (x + overhang)).
-    # With h linearized at `at` instead of the mean, the innovation is z - (h(at) + h'(at) * (mean - at)): one
-    # step of an iterated extended Kalman filter.
-    bottom_std = np.hypot(camera.height_std_m / camera.height_m, oncoming * _ONCOMING_BOTTOM_STD)
-    jacobian = np.zeros_like(mean)
 
-    def correct_by_bottom(at: Floats) -> tuple[Floats, Floats]:
-        """Correct by the bottom edge, linearized at distances `at`."""
+def _start(mean: Floats, cov: Floats, view: _View, camera: Camera) -> _View:
+    """Set unknown distances, in place, to those of the first measurement, so that it is linearized there.
+
+    Returns the view without the bottom edges where the width was the better measurement.
+    """
+    unknown = cov[:, DISTANCE, DISTANCE] > _INITIAL_DISTANCE_STD**2 / 2
+    if not unknown.any():
+        return view
+    whole = view.sees_width & ~view.is_bound
+    bottom_std = np.hypot(view.edge_std[:, 1], camera.total_horizon_std_px)
+    below = view.sees_bottom & (view.below_horizon > 2 * bottom_std)
+    below_px = np.where(below, view.below_horizon, 1.0)
+    # The measurement with the smaller relative error.
+    side = view.lateral_px / view.width_scale
+    width_error = np.sqrt(cov[:, WIDTH, WIDTH] + np.square(side) * cov[:, LENGTH, LENGTH])
+    is_better = below & ((bottom_std / below_px < width_error) | ~whole)
+    known = unknown & (below | whole)
+    # Tall vehicles are wide: vans, buses and trucks.
+    tall = np.clip(_WIDTH_OF_HEIGHT * (view.tallness - _TALL), 0.0, _MAX_TALL_WIDTH)
+    mean[:, WIDTH] = np.where(known & whole, tall, mean[:, WIDTH])
+    by_bottom = camera.focal_px * camera.height_m / below_px - camera.overhang_m
+    by_width = view.width_scale * np.exp(mean[:, WIDTH]) / view.sides[:, 0]
+    first = np.clip(np.where(is_better, by_bottom, by_width), _MIN_DISTANCE, _MAX_DISTANCE)
+    mean[known, DISTANCE] = first[known]
+    return view._replace(sees_bottom=view.sees_bottom & (is_better | ~unknown))
+
+
+def _correct_by_bottom(mean: Floats, cov: Floats, view: _View, camera: Camera) -> tuple[Floats, Floats]:
+    """Correct by the logarithm of the pixels below the horizon.
+
+    The measurement is z = log(below_horizon), the model h(x) = log(focal * height / (x + overhang)). With h
+    linearized at `at` instead of the mean, the innovation is z - (h(at) + h'(at) * (mean - at)): one step of
+    an iterated extended Kalman filter.
+    """
+
+    def correct(at: Floats) -> tuple[Floats, Floats]:
         tires = at + camera.overhang_m
-        expected = bottom_scale / tires
-        log_ratio, tangent_px = _log_by_tangent(below_horizon, expected)
-        jacobian[:, 0] = -1 / tires
-        innovation = log_ratio - (at - mean[:, 0]) / tires
-        systematic = np.square(horizon_std / tangent_px) + np.square(bottom_std)
-        systematic += np.square(camera.overhang_std_m / tires)
-        variance = np.square(edge_std[:, 1] / tangent_px) * box_frames + systematic * shared_frames
-        return _scalar_update(mean, cov, jacobian, innovation, np.where(bottom_visible, variance, np.inf))
+        log_ratio, tangent_px = _log_by_tangent(view.below_horizon, camera.focal_px * camera.height_m / tires)
+        jacobian = np.zeros_like(mean)
+        jacobian[:, DISTANCE], jacobian[:, HORIZON], jacobian[:, CAMERA_HEIGHT] = (
+            -1 / tires,
+            1 / tangent_px,
+            1,
+        )
+        innovation = log_ratio - (at - mean[:, DISTANCE]) / tires - mean[:, CAMERA_HEIGHT]
+        shared = np.square(view.oncoming * _ONCOMING_BOTTOM_STD) + np.square(camera.overhang_std_m / tires)
+        variance = np.square(view.edge_std[:, 1] / tangent_px) * view.box_frames + shared * view.shared_frames
+        return _scalar_update(mean, cov, jacobian, innovation, np.where(view.sees_bottom, variance, np.inf))
 
     # Far away, noise dominates the correction, so that the predicted distance is more exact.
-    corrected = np.maximum(correct_by_bottom(mean[:, 0])[0][:, 0], _MIN_DISTANCE)
-    mean, cov = correct_by_bottom(np.where(corrected < _RELINEARIZED, corrected, mean[:, 0]))
-    np.clip(mean[:, 0], _MIN_DISTANCE, _MAX_DISTANCE, out=mean[:, 0])
+    predicted = mean[:, DISTANCE]
+    corrected = np.maximum(correct(predicted)[0][:, DISTANCE], _MIN_DISTANCE)
+    return correct(np.where(corrected < _RELINEARIZED, corrected, predicted))
 
-    # Logarithm of the width in pixels: log(width_scale) + log(relative width) - log(distance), with the error
-    # of the length to first order.
-    side = lateral_px / width_scale
-    innovation = np.log(sides[:, 0] / width_scale) - mean[:, 2] - side * mean[:, 3] + np.log(mean[:, 0])
-    systematic = _width_variance(measured, camera, width_scale, side)
+
+def _correct_by_width(
+    mean: Floats, cov: Floats, view: _View, measured: Measurements, camera: Camera
+) -> tuple[Floats, Floats]:
+    """Correct by the logarithm of the width: log(width_scale) + log(relative width) - log(distance).
+
+    The error of the length is included to first order.
+    """
+    width, side = view.sides[:, 0], view.lateral_px / view.width_scale
+    jacobian = np.zeros_like(mean)
+    jacobian[:, DISTANCE], jacobian[:, WIDTH], jacobian[:, LENGTH] = -1 / mean[:, DISTANCE], 1, side
+    expected = mean[:, WIDTH] + side * mean[:, LENGTH] - np.log(mean[:, DISTANCE])
+    innovation = np.log(width / view.width_scale) - expected
+    # Detectors cut the long sides of vehicles short, where the whole box would be wider than usual.
+    aspect = view.width_scale / (camera.focal_px * camera.vehicle_height_m)
+    cut_short = np.log(np.maximum(aspect / _MAX_ASPECT, 1.0))
+    covered_std = np.where(measured.covered > 0, _COVERED_STD, 0.0)
+    shared = np.square(cut_short) + np.square(covered_std) + np.square(side * camera.vehicle_length_std_m)
     # Both edges are measured with the same error.
-    variance = np.square(edge_std[:, 0] / sides[:, 0]) * 2 * box_frames + systematic * shared_frames
-    jacobian[:, 0], jacobian[:, 2], jacobian[:, 3] = -1 / mean[:, 0], 1.0, side
-    variance = np.where(width_visible & ~(is_bound & (innovation < 0)), variance, np.inf)
-    mean, cov = _scalar_update(mean, cov, jacobian, innovation, variance)
-    return states._replace(range_mean=np.clip(mean, *_LIMITS), range_cov=cov)
+    variance = 2 * np.square(view.edge_std[:, 0] / width) * view.box_frames + shared * view.shared_frames
+    informs = view.sees_width & ~(view.is_bound & (innovation < 0))
+    return _scalar_update(mean, cov, jacobian, innovation, np.where(informs, variance, np.inf))
+
+
+def _correct_by_height(mean: Floats, cov: Floats, view: _View, camera: Camera) -> tuple[Floats, Floats]:
+    """Correct by the logarithm of the height, which neither visible sides nor pitch change.
+
+    How it grows gives the speed: the size of a vehicle over its change is the time to collision (Lee, "A
+    theory of visual control of braking based on information about time-to-collision", *Perception*, 1976).
+    """
+    tires = mean[:, DISTANCE] + camera.overhang_m
+    jacobian = np.zeros_like(mean)
+    jacobian[:, DISTANCE], jacobian[:, HEIGHT] = -1 / tires, 1
+    scale = camera.focal_px * camera.vehicle_height_m
+    innovation = np.log(view.sides[:, 1] * tires / scale) - mean[:, HEIGHT]
+    shared = np.square(camera.overhang_std_m / tires)
+    height_std = view.edge_std[:, 1] / view.sides[:, 1]
+    variance = 2 * np.square(height_std) * view.box_frames + shared * view.shared_frames
+    return _scalar_update(mean, cov, jacobian, innovation, np.where(view.sees_height, variance, np.inf))
 
 
 def _log_by_tangent(pixels: Floats, expected: Floats) -> tuple[Floats, Floats]:
@@ -180,25 +286,12 @@ def _log_by_tangent(pixels: Floats, expected: Floats) -> tuple[Floats, Floats]:
     return np.log(tangent_px / expected) + (pixels - tangent_px) / tangent_px, tangent_px
 
 
-def _width_variance(measured: Measurements, camera: Camera, width_scale: Floats, side: Floats) -> Floats:
-    """Variance ``(N,)`` of the logarithm of boxes' widths that more frames do not average out.
-
-    `width_scale` is the width in pixels times the distance, of which a meter of length adds the part `side`.
-    """
-    # Detectors cut the long sides of vehicles short, where the whole box would be wider than usual.
-    aspect = width_scale / (camera.focal_px * camera.vehicle_height_m)
-    cut_short = np.log(np.maximum(aspect / _MAX_ASPECT, 1.0))
-    covered_std = np.where(measured.covered > 0, _COVERED_STD, 0.0)
-    side_std = side * camera.vehicle_length_std_m
-    return np.asarray(np.square(cut_short) + np.square(covered_std) + np.square(side_std))
-
-
 def _scalar_update(
     mean: Floats, cov: Floats, jacobian: Floats, innovation: Floats, variance: Floats
 ) -> tuple[Floats, Floats]:
     """Correct each state by one scalar measurement; an infinite variance changes nothing.
 
-    `mean` and `jacobian` are ``(N, 4)``, `cov` ``(N, 4, 4)``, `innovation` and `variance` ``(N,)``. With one
+    `mean` and `jacobian` are ``(N, 7)``, `cov` ``(N, 7, 7)``, `innovation` and `variance` ``(N,)``. With one
     measurement the innovation's covariance ``h P h' + r`` is a number, so that no matrix is inverted. The
     variance `r` of an outlier is increased by the square of its innovation in units of `_OUTLIER` standard
     errors (Huber's weights).
@@ -217,7 +310,7 @@ def estimate_distances(
     distance, speed = states.range_mean[:, 0], states.range_mean[:, 1]
     distance_std, speed_std = np.sqrt(np.maximum(states.range_cov[:, [0, 1], [0, 1]], 0)).T
     known = (distance_std <= _MAX_RANGE_STD * distance) & (time_since_update <= _MAX_RANGE_AGE)
-    speed_known = known & (speed_std <= _MAX_RANGE_SPEED_STD)
+    speed_known = known & (speed_std <= np.maximum(_MAX_RANGE_SPEED_STD, _MAX_SPEED_ERROR * np.abs(speed)))
     # The focal length scales all measurements alike, so no filter averages its error out.
     distance_std = np.hypot(distance_std, distance * camera.focal_std)
     speed_std = np.hypot(speed_std, speed * camera.focal_std)

@@ -62,13 +62,13 @@ class KalmanStates(NamedTuple):
     mean: Floats  # (N, 8) box and its velocity
     cov: Floats  # (N, 8, 8)
     innovation_mean: Floats  # (N, 4) moving average of each edge's innovation in standard errors
-    range_mean: Floats  # (N, 4) distance, speed, logarithm of the relative width, error of the length
-    range_cov: Floats  # (N, 4, 4)
+    range_mean: Floats  # (N, 7) distance, speed and what the errors of their measurements share
+    range_cov: Floats  # (N, 7, 7)
 
     @classmethod
     def empty(cls) -> KalmanStates:
         """States of no tracks."""
-        return cls(*(np.empty((0, *shape)) for shape in ((8,), (8, 8), (4,), (4,), (4, 4))))
+        return cls(*(np.empty((0, *shape)) for shape in ((8,), (8, 8), (4,), (7,), (7, 7))))
 
     def boxes(self) -> Floats:
         """``(N, 4)`` boxes, including parts outside the frame."""
