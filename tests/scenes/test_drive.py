@@ -128,3 +128,18 @@ def test_labels_contain_the_truth(tmp_path):
         assert float(row["truncated"]) == pytest.approx(true.truncated, abs=5e-4)
         assert float(row["distance_m"]) == pytest.approx(true.distance_m, abs=5e-3)
         assert float(row["speed_mps"]) == pytest.approx(true.speed_mps, abs=5e-3)
+
+
+def test_rough_drives_have_other_widths_a_rolling_camera_and_hills():
+    options = {"frames": 30, "fps": 10, "shape": (180, 320), "scenario": "traffic", "random_state": 3}
+    rough, level = render_drive(**options, rough=True), render_drive(**options)
+    assert rough.truth != level.truth
+    assert rough[29].truth == rough.truth_of(29)
+    # A vehicle's pixels and its box move together when the camera rolls and pitches.
+    for frame in (0, 29):
+        scene = rough[frame]
+        for row in scene.truth:
+            if row.occluded_fraction == 0 and row.truncated == 0:
+                rows, columns = np.nonzero(scene.instance_map == row.track)
+                found = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+                np.testing.assert_allclose(found, row.box, atol=1)

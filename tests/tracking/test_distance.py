@@ -79,20 +79,28 @@ def test_inputs_are_not_modified():
 
 
 def ranges(mean, cov):
-    """States of a track with this distance, speed and width."""
+    """States of a track with these first values; the others keep their priors."""
     states = initiate_states(*initiate(BOXES[:1], np.ones((1, 4))), CAMERA)
-    return states._replace(range_mean=np.array([mean], float), range_cov=np.array([cov], float))
+    count = len(mean)
+    states.range_mean[0, :count] = mean
+    states.range_cov[0, :count, :count] = cov
+    return states
 
 
 def test_distances_are_predicted_at_constant_speed():
     cov = np.array([[4.0, 0.5, 0.1, 0], [0.5, 9.0, 0.2, 0], [0.1, 0.2, 0.04, 0], [0, 0, 0, 0.5]])
-    found = predict_distances(ranges([30.0, -5.0, 0.1, 0.3], cov), 0.2, CAMERA)
-    np.testing.assert_allclose(found.range_mean, [[29.0, -5.0, 0.1, 0.3]])
+    before = ranges([30.0, -5.0, 0.1, 0.3, 2.0], np.zeros((5, 5)))
+    before.range_cov[0, :4, :4] = cov
+    found = predict_distances(before, 0.2, CAMERA)
+    # The error of the horizon returns to 0 within a second.
+    np.testing.assert_allclose(found.range_mean, [[29.0, -5.0, 0.1, 0.3, 2 * math.exp(-0.2), 0, 0]])
+    horizon = CAMERA.total_horizon_std_px**2 * (1 - math.exp(-0.4))
+    np.testing.assert_allclose(np.diag(found.range_cov[0])[4:6], [horizon, before.range_cov[0, 5, 5]])
     transition = np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     expected = transition @ cov @ transition.T
     expected[:2, :2] += 1.5**2 * np.array([[0.2**3 / 3, 0.2**2 / 2], [0.2**2 / 2, 0.2]])
     expected[2, 2] += (CAMERA.vehicle_width_std_m / CAMERA.vehicle_width_m) ** 2 * 0.2 / 20
-    np.testing.assert_allclose(found.range_cov[0], expected)
+    np.testing.assert_allclose(found.range_cov[0, :4, :4], expected)
     for start, speed, end in ((2.0, -50.0, 1.0), (499.0, 50.0, 500.0)):
         assert predict_distances(ranges([start, speed, 0, 0], cov), 0.2, CAMERA).range_mean[0, 0] == end
 
@@ -115,8 +123,9 @@ def test_the_width_corrects_distance_width_and_length(right, speed):
     edge_std = math.hypot(CAMERA.bottom_std_px * CAMERA.pixel_scale, CAMERA.box_std * 100)
     variance = 2 * (edge_std / 100) ** 2 + 50 * (side * CAMERA.vehicle_length_std_m) ** 2
     gain = cov @ jacobian / (jacobian @ cov @ jacobian + variance)
-    np.testing.assert_allclose(found.range_mean[0], [20.0, speed, 0.05, 0.3] + gain * innovation)
-    np.testing.assert_allclose(found.range_cov[0], cov - np.outer(gain, jacobian @ cov), atol=1e-9)
+    np.testing.assert_allclose(found.range_mean[0, :4], [20.0, speed, 0.05, 0.3] + gain * innovation)
+    expected = cov - np.outer(gain, jacobian @ cov)
+    np.testing.assert_allclose(found.range_cov[0, :4, :4], expected, atol=1e-9)
 
 
 def test_the_bottom_edge_of_an_oncoming_vehicle_has_less_weight():
@@ -141,7 +150,7 @@ def test_the_bottom_edge_of_an_oncoming_vehicle_has_less_weight():
 def test_distance_width_and_length_are_limited(mean, limited):
     measured = Measurements.from_boxes(BOXES[:1], SHAPE, merged=True)  # it shows neither edge
     found = update_distances(ranges(mean, np.eye(4)), measured, CAMERA, 0.04, 0.04)
-    np.testing.assert_allclose(found.range_mean, [limited])
+    np.testing.assert_allclose(found.range_mean[0, :4], limited)
 
 
 @pytest.mark.parametrize(
@@ -197,8 +206,8 @@ def test_the_width_of_a_vehicle_behind_another_one_is_a_lower_bound(edge):
     assert distance(1.2, hidden=hidden) == 20
     # A part that is wider than expected shows that the vehicle is nearer, or wider.
     assert distance(2.2, hidden=hidden) == distance(2.2) < 19.5
-    # Above and below a vehicle, nothing is hidden.
-    assert distance(1.2, hidden=np.array([False, True, False, True])) == distance(1.2)
+    # Above a vehicle, nothing is hidden.
+    assert distance(1.2, hidden=np.array([False, True, False, False])) == distance(1.2)
 
 
 def test_the_first_distance_of_a_vehicle_behind_another_one_is_not_that_of_its_width():
@@ -208,3 +217,46 @@ def test_the_first_distance_of_a_vehicle_behind_another_one_is_not_that_of_its_w
     assert first_range(half, camera=camera, hidden=hidden)[0] == pytest.approx(30)
     # Without a visible bottom edge, its distance is unknown.
     assert first_range([*half[:3], 720.0], hidden=hidden)[1] > 500
+
+
+def follow(distances, *, height_m=1.5, speed=0.0, shift=0.0, **options):
+    """State after boxes at these distances, one each tenth of a second, whose width is not visible."""
+    states = None
+    for distance in distances:
+        box = np.array([box_at(distance)])
+        box += [[0, shift, 0, shift]]
+        box[:, 1] = box[:, 3] - CAMERA.focal_px * height_m / (distance + CAMERA.overhang_m)
+        if states is None:
+            states = initiate_states(*initiate(box, np.ones((1, 4))), CAMERA)
+            states.range_mean[0, 1] = speed
+        else:
+            states = predict_distances(states, 0.1, CAMERA)
+        # A nearer vehicle hides a part of its side.
+        measured = Measurements.from_boxes(box, SHAPE, hidden=[True, False, False, False], **options)
+        states = update_distances(states, measured, CAMERA, 0.1, 0.04)
+    return states.range_mean[0], np.sqrt(np.diag(states.range_cov[0]))
+
+
+@pytest.mark.parametrize("height_m", [1.4, 3.5])
+def test_growth_gives_the_speed_of_cars_and_trucks(height_m):
+    distances = 40 - 10 * 0.1 * np.arange(20)
+    mean, std = follow(distances, height_m=height_m)
+    assert mean[1] == pytest.approx(-10, abs=1.0)
+    assert std[1] < 2
+
+
+def test_a_shifted_horizon_changes_neither_the_speed_nor_the_stated_error_for_long():
+    distances = 30 - 5 * 0.1 * np.arange(20)
+    level, pitched = (follow(distances, shift=shift) for shift in (0.0, 4.0))
+    assert pitched[0][1] == pytest.approx(level[0][1], abs=0.7)
+    assert pitched[0][0] == pytest.approx(distances[-1], abs=2 * pitched[1][0])
+
+
+def test_a_nearer_vehicle_that_hides_the_bottom_edge_leaves_the_distance_unknown():
+    distances = np.full(5, 30.0)
+    assert follow(distances)[1][0] < 5
+    boxes = np.array([box_at(45.0)])
+    states = initiate_states(*initiate(boxes, np.ones((1, 4))), CAMERA)
+    hidden = [True, False, False, True]
+    measured = Measurements.from_boxes(boxes, SHAPE, hidden=hidden)
+    assert update_distances(states, measured, CAMERA, 0.1, 0.04).range_cov[0, 0, 0] > 500**2

@@ -114,8 +114,8 @@ class SceneConfig:
     rain: float = 0.0  # 0 (dry) to 1 (heavy)
     jpeg_quality: int | None = None  # None: the images are not compressed
     margin: int = 0  # rows drawn above and below the frame, for a camera that pitches
-    roll: float = 0.0  # rows by which the image falls per column to the right of the middle
     seed: int = 0
+    roll: float = 0.0  # rows by which the image falls per column to the right of the middle
 
     @property
     def center_px(self) -> float:

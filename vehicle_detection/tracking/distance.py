@@ -51,8 +51,8 @@ _OTHER_SPEED, _FORGET_TIME = 2.5, 0.2
 # Maximum relative error of a reported distance, without that of the focal length; maximum age of its last
 # measurement (s); and error of a reported speed: in m/s, or as a fraction of it, whichever is larger.
 _MAX_RANGE_STD, _MAX_RANGE_AGE, _MAX_RANGE_SPEED_STD, _MAX_SPEED_ERROR = 0.4, 0.5, 6.0, 0.25
-# Relative error of the width of a box that nearer vehicles partly cover.
-_COVERED_STD = 0.15
+# Relative error of the width of a box over the fraction of it that a nearer vehicle covers.
+_COVERED_STD = 0.5
 # Vehicles in another lane that approach fast are mostly oncoming, and a barrier may hide their wheels:
 # minimum speed (m/s), length (m) of the side that their boxes lack, and relative error of the bottom edge.
 _ONCOMING_SPEED, _ONCOMING_CUT, _ONCOMING_BOTTOM_STD = 15.0, 1.0, 0.3
@@ -184,7 +184,7 @@ def _view(mean: Floats, measured: Measurements, camera: Camera, dt: float, corre
 def _start(mean: Floats, cov: Floats, view: _View, camera: Camera) -> _View:
     """Set unknown distances, in place, to those of the first measurement, so that it is linearized there.
 
-    Returns the view without the bottom edges where the width was the better measurement.
+    Returns the view without the heights, and without bottom edges where the width was the better measurement.
     """
     unknown = cov[:, DISTANCE, DISTANCE] > _INITIAL_DISTANCE_STD**2 / 2
     if not unknown.any():
@@ -205,7 +205,8 @@ def _start(mean: Floats, cov: Floats, view: _View, camera: Camera) -> _View:
     by_width = view.width_scale * np.exp(mean[:, WIDTH]) / view.sides[:, 0]
     first = np.clip(np.where(is_better, by_bottom, by_width), _MIN_DISTANCE, _MAX_DISTANCE)
     mean[known, DISTANCE] = first[known]
-    return view._replace(sees_bottom=view.sees_bottom & (is_better | ~unknown))
+    sees_bottom, sees_height = view.sees_bottom & (is_better | ~unknown), view.sees_height & ~unknown
+    return view._replace(sees_bottom=sees_bottom, sees_height=sees_height)
 
 
 def _correct_by_bottom(mean: Floats, cov: Floats, view: _View, camera: Camera) -> tuple[Floats, Floats]:
@@ -251,8 +252,11 @@ def _correct_by_width(
     # Detectors cut the long sides of vehicles short, where the whole box would be wider than usual.
     aspect = view.width_scale / (camera.focal_px * camera.vehicle_height_m)
     cut_short = np.log(np.maximum(aspect / _MAX_ASPECT, 1.0))
-    covered_std = np.where(measured.covered > 0, _COVERED_STD, 0.0)
-    shared = np.square(cut_short) + np.square(covered_std) + np.square(side * camera.vehicle_length_std_m)
+    shared = (
+        np.square(cut_short)
+        + np.square(_COVERED_STD * measured.covered)
+        + np.square(side * camera.vehicle_length_std_m)
+    )
     # Both edges are measured with the same error.
     variance = 2 * np.square(view.edge_std[:, 0] / width) * view.box_frames + shared * view.shared_frames
     informs = view.sees_width & ~(view.is_bound & (innovation < 0))
