@@ -372,7 +372,6 @@ class _Valid:
             "search_windows": {"windows": boxes, "jobs": 1},
             "single_img_features": {"image": patches[0]},
             "split_random": {"patches_or_labels": labels},
-            "segment_clock": {"source": self.instances["FrameSource"]},
             "split_sources": {"train": ("a",), "test": ("b",)},
             "track": {"source": clip, "detector": detector},
             "train_and_evaluate": {"params": params, "seeds": 1, "jobs": 1},
