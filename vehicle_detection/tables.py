@@ -49,7 +49,8 @@ LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autoricksha
 _CLASS_COLUMNS = ("class", "label", "category")
 
 _FLAGS = {"false": False, "true": True, "0": False, "1": True, "0.0": False, "1.0": True}
-_ABSURD, _MAX_ID = 1e9, 2**62  # distances and speeds beyond the first are unknown
+# Distances and speeds beyond the first are unknown, corners of boxes are errors.
+_ABSURD, _MAX_ID = 1e9, 2**62
 
 
 class _Column(NamedTuple):
@@ -75,6 +76,7 @@ _COLUMNS = {
     "ignore": _Column(False),
 }
 """All columns except ``frame`` and the corners of the boxes."""
+_CORNER = _Column(math.nan, -_ABSURD, _ABSURD, f"a number of pixels up to {_ABSURD:g}")
 
 _VALUE_COLUMNS = TRACK_COLUMNS[6:]  # all but frame, track and box
 _APPENDED = (*_VALUE_COLUMNS, "time_since_update")  # of a `Track`
@@ -548,7 +550,7 @@ def parse_number(cell: Any, name: str, place: str) -> float:
 
 def _parse_numbers(name: str, cells: Sequence[Any], places: Sequence[str]) -> NDArray[Any]:
     """Numbers of a column; a missing one, except for a corner or a score, gets the column's default."""
-    column = _COLUMNS.get("track_id" if name == "track" else name, _Column(math.nan))
+    column = _COLUMNS.get("track_id" if name == "track" else name, _CORNER)
     kind = type(column.missing)
     values = []
     for cell, place in zip(cells, places, strict=True):

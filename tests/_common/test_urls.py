@@ -21,6 +21,23 @@ CLOUDFRONT = "?Expires=1769847300&Signature=ab~12__&Key-Pair-Id=K2J&Policy=eyJ"
         (f"{HOST}?camera=front&page=2", f"{HOST}?camera=front&page=2"),
         (f"{HOST}?monkey=3&keyframe=4", f"{HOST}?monkey=3&keyframe=4"),
         ("a drive at 5:00 @ home", "a drive at 5:00 @ home"),
+        ("http://cam/v.cgi?loginuse=anna&loginpas=word", "http://cam/v.cgi?loginuse=***&loginpas=***"),
+        ("http://cam/v?psw=word&ch=1", "http://cam/v?psw=***&ch=1"),
+        ("http://cam/v?sid=word; check", "http://cam/v?sid=***; check"),
+        ("http://cam/v?hdnts=exp=1~hmac=word", "http://cam/v?hdnts=***"),
+        ("http://cam/v?pw=wo#rd", "http://cam/v?pw=***"),
+        ("http://cam/v?page=2#access_token=word", "http://cam/v?page=2#access_token=***"),
+        ("http://anna:pa#s/s@cam:80/x", "http://***@cam:80/x"),
+        ("rtsp://anna:my word@cam/x: refused", "rtsp://***@cam/x: refused"),
+        ("http://anna:12/34@cam/x", "http://***@cam/x"),
+        ("srt://cam:9000?passphrase=word&mode=caller", "srt://cam:9000?passphrase=***&mode=caller"),
+        ("http://a:1@b/x, http://c:2@d/y", "http://***@b/x, http://***@d/y"),
+        ("http://cam:8080/x failed at 5 @ home", "http://cam:8080/x failed at 5 @ home"),
+        (
+            "rtsp://cam/user=anna_password=a_word_channel=1_stream=0.sdp",
+            "rtsp://cam/user=***_password=***_channel=1_stream=0.sdp",
+        ),
+        ("s3://fleet/date=2026-01-31/camera=front/a.mp4", "s3://fleet/date=2026-01-31/camera=front/a.mp4"),
     ],
 )
 def test_secrets_are_hidden(text, shown):

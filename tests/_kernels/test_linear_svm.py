@@ -1,3 +1,7 @@
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -58,3 +62,14 @@ def test_the_seed_changes_only_the_last_digits():
     np.testing.assert_allclose(scores_of(first, features), scores_of(other, features), atol=5e-3)
     assert first.scale[-1] == 1.0
     assert first.coef[-1] == pytest.approx(0, abs=1e-6)
+
+
+def test_compiled_and_cached_kernels_give_the_same_result(tmp_path):
+    code = (
+        "import numpy as np; from vehicle_detection._kernels import fit_svm; rng = np.random.default_rng(0);"
+        "features = rng.normal(size=(90, 300)).astype(np.float32);"
+        "print(fit_svm(features, np.arange(90) % 2, np.full(90, 0.01)).coef.tobytes())"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    first, second = (subprocess.check_output([sys.executable, "-c", code], env=environment) for _ in range(2))
+    assert first == second

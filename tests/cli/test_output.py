@@ -49,3 +49,13 @@ def test_two_names_of_a_file_are_one_file(tmp_path):
     os.link(tmp_path / "a.csv", tmp_path / "A2.csv")  # as A.csv on a disk that ignores case
     with pytest.raises(InvalidInputError, match=r"--json .+A2.csv is also LABELS .+a.csv; choose another"):
         check_distinct_paths({"--json": tmp_path / "A2.csv"}, {"LABELS": tmp_path / "a.csv"})
+
+
+def test_control_characters_of_names_are_escaped(capsys):
+    print_error("error: a\x1b[2J\u202eb\x9b.mp4 is missing")
+    print_table("names", ["name"], [["c\x1b]0;title\x07"]])
+    output.print_facts("d\x1b[1m", {"e": "f\rg"})
+    out, err = capsys.readouterr()
+    assert err == "error: a\\x1b[2J\\u202eb\\x9b.mp4 is missing\n"
+    assert all(name in out for name in ("c\\x1b]0;title\\x07", "d\\x1b[1m", "f\\rg"))
+    assert "\x1b" not in out

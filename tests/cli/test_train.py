@@ -137,3 +137,6 @@ def test_info_of_a_model_with_incomplete_scores(tmp_path):
     scores = info({"splits": {"random": {"accuracy": 0.5, "test": "x"}}})
     assert re.search(r"accuracy\s+─+\s+random fifth +0\.5000", scores)
     assert "random fifth" in info({"splits": {"random": {"accuracy": 10**400}}})
+    held_out = {"held_out": {"a": {"f1": "x"}}, "held_out_before": 1}
+    for odd in ({"splits": {"random": 3}}, {"left_out": {"a": [1]}}, held_out):
+        assert "9432 features" in info(odd)

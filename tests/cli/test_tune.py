@@ -110,7 +110,7 @@ def test_tune_refuses_bad_input(patches, material, tmp_path, monkeypatch):
         "{patches} {grid} -o t.csv --frames {material}/road": "--frames and --labels .*; give both",
         "{patches} {grid} -o t.csv --horizon 0.5": "--horizon needs --frames",
         "--vehicles missing.zip {others} {grid} -o t.csv": "missing.zip does not exist",
-        "{patches} {grid} -o a.csv": "has other columns than this release writes",
+        "{patches} {grid} -o a.csv": "is not a table of trials",
         "--vehicles a.csv {others} {grid} -o a.csv": "is also --vehicles",
     }
     vehicles, others = (f"{name} {path}" for name, path in (patches[:2], patches[2:]))

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from vehicle_detection import read_labels
-from vehicle_detection.errors import DatasetError
+from vehicle_detection import Detections, TrackTable, read_labels, write_labels
+from vehicle_detection.errors import DatasetError, InvalidInputError
 
 COCO = {
     "images": [{"id": 1, "file_name": "a.jpg"}, {"id": 2, "file_name": "b.jpg"}],
@@ -138,3 +138,28 @@ def test_folders_of_other_formats_are_named(name, tool, tmp_path):
     (tmp_path / name).write_text("")
     with pytest.raises(DatasetError, match=f"{tool}, which are not read; export one COCO file"):
         read_labels(tmp_path)
+
+
+def test_names_that_spreadsheets_take_for_formulas(tmp_path):
+    names = ["=1+1.jpg", "+a.jpg", "-b.jpg", "@c.jpg", "d.jpg"]
+    table = TrackTable(names, None, [[0, 0, 9, 9]] * 5)
+    write_labels(table, tmp_path / "a.csv")
+    cells = [line.partition(",")[0] for line in (tmp_path / "a.csv").read_text().splitlines()[1:]]
+    assert all(cell[0] not in "=+-@" for cell in cells)
+    assert sorted(read_labels(tmp_path / "a.csv")["frame"].tolist()) == sorted(names)
+
+
+@pytest.mark.parametrize("kind", ["kitti", "yolo"])
+def test_a_frame_name_with_a_null_byte_is_no_file(kind, tmp_path):
+    shape = {"shape": (20, 20)} if kind == "yolo" else {}
+    with pytest.raises(InvalidInputError, match="labels name a frame with a null byte"):
+        write_labels(TrackTable(["a\0b"], None, [[0, 0, 9, 9]]), tmp_path / "new", format=kind, **shape)
+
+
+@pytest.mark.parametrize("number", ["1e200", "-1e200", "1e10"])
+def test_corners_of_absurd_size_are_errors(number, tmp_path):
+    (tmp_path / "a.csv").write_text(f"frame,track,x1,y1,x2,y2\n0,1,0,0,9,9\n1,1,{number},0,2e10,9\n")
+    with pytest.raises(DatasetError, match="line 3: x1 must be a number of pixels"):
+        read_labels(tmp_path / "a.csv")
+    with pytest.raises(InvalidInputError, match="values beyond 1e"):
+        Detections([[0, 0, 1e200, 9]], [1.0])

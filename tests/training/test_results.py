@@ -68,10 +68,35 @@ def test_a_trial_that_two_runs_measure_is_one_row(tmp_path, suffix):
     pd.testing.assert_frame_equal(read_results(path), example_table(2))
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.csv", "my only notes"),
+        ("a.jsonl", '{"a": 1}'),
+        ("a.csv", "frame,note\n1,a"),
+        ("a.jsonl", "[1]"),
+    ],
+)
+def test_files_of_others_are_kept(name, text, tmp_path):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(DatasetError, match="is not a table of trials"):
+        RowStore(tmp_path / name, COLUMNS)
+    assert (tmp_path / name).read_text() == text
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".jsonl"])
+def test_a_first_line_that_was_interrupted_is_written_again(suffix, tmp_path):
+    path, other = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
+    RowStore(other, COLUMNS).add(example_row(0))
+    path.write_bytes(other.read_bytes()[:7])
+    RowStore(path, COLUMNS).add(example_row(0))
+    assert path.read_bytes() == other.read_bytes()
+
+
 def test_damaged_and_foreign_stores(tmp_path):
     path = tmp_path / "rows.csv"
     path.write_text("frame,track\n1,2\n")
-    with pytest.raises(DatasetError, match="has other columns than this release writes; choose another"):
+    with pytest.raises(DatasetError, match="is not a table of trials, or of another release; choose another"):
         RowStore(path, COLUMNS)
     RowStore(tmp_path / "other.csv", COLUMNS).add(example_row(0))
     text = (tmp_path / "other.csv").read_text()

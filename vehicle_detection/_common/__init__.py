@@ -50,6 +50,8 @@ from vehicle_detection._common.text import (
     local_path,
     natural_key,
     pluralize,
+    printable,
+    spreadsheet_text,
     stable_url,
 )
 from vehicle_detection._common.threads import (

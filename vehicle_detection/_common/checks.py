@@ -218,6 +218,9 @@ def check_sequence(values: object, name: str, of: str) -> tuple[Any, ...]:
     return tuple(values)
 
 
+_MAX_PIXEL = 1e9  # areas of larger boxes may overflow
+
+
 def check_boxes(boxes: Any, name: str = "boxes") -> NDArray[Any]:
     """Return `boxes` as an ``(N, 4)`` array of finite boxes with ``x1 <= x2`` and ``y1 <= y2``.
 
@@ -240,8 +243,9 @@ def check_boxes(boxes: Any, name: str = "boxes") -> NDArray[Any]:
             f"{name} must be an (N, 4) number array of [x1, y1, x2, y2] or corner pairs "
             f"((x1, y1), (x2, y2)), got {describe(boxes)}; {remedy}"
         )
-    if not np.isfinite(array).all():
-        raise InvalidInputError(f"{name} must be finite, got NaN or infinity; drop those rows")
+    if not ((array >= -_MAX_PIXEL) & (array <= _MAX_PIXEL)).all():
+        found = f"values beyond {_MAX_PIXEL:g}" if np.isfinite(array).all() else "NaN or infinity"
+        raise InvalidInputError(f"{name} must be finite, got {found}; drop those rows")
     inverted = (array[:, 2] < array[:, 0]) | (array[:, 3] < array[:, 1])
     if inverted.any():
         row = int(np.argmax(inverted))

@@ -7,13 +7,25 @@ from urllib.parse import unquote_plus
 
 _URL = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://")
 _FILE_URL = re.compile("file://(localhost(?=/))?", re.IGNORECASE)
-# A password may hold an "@": the host begins after the last one.
-_CREDENTIALS = re.compile(r"(?<=://)[^\s/?#]*@")
+# A user and a password, which may hold "@", "/", "#" and spaces: the host begins after the last "@".
+_CREDENTIALS = re.compile(r"(?<=://)(?:[^\s/@:]*:(?!\d{1,5}(?!\d|\S*@))(?:(?!://)[^\n])*|[^\s/?#]*)@")
 _PASSWORD = re.compile(r"(?<=://)([^\s/?#:@]*):[^\s/?#]*@")
-# Parameters of queries that are secret; punctuation after a value belongs to the sentence.
-_SECRET = re.compile(
-    r"(?<=[?&])([\w.-]*(?:signature|token|credential|secret|passw|api[_-]?key|access[_-]?key)[\w.-]*"
-    r"|sig|key|key-pair-id|policy|pass|pwd|jwt|auth(?:orization|key)?)=[^\s&#'\"<>]*[^\s&#'\"<>).,:;]",
+# A parameter of a query or a fragment; punctuation after a value belongs to the sentence.
+_PARAMETER = re.compile(r"(?<=[?&;#])([\w.~%\[\]-]+)=([^\s&;'\"<>]*[^\s&;'\"<>).,:])")
+# Parameters that are no secrets. All others may be one: each camera and service has its own names.
+_HARMLESS = re.compile(
+    r"cam(era)?|ch(annel)?|(sub)?stream(type)?|subtype|page|part|track|segment|clip|file(name)?|name|path|type|format|codec"
+    r"|mode|profile|quality|size|resolution|width|height|fps|(frame)?rate|timeout|latency|pkt_size|transport|overrun_nonfatal"
+    r"|fifo_size|localaddr|ttl|version(id)?|date|day|start|end|from|to|t|time|v|x-amz-(algorithm|date|expires|signedheaders)"
+    r"|expires|s[eprv]|response-.*",
+    re.IGNORECASE,
+)
+# Values that are too short for a secret, such as numbers of channels.
+_SHORT = re.compile(r"\d{1,2}|true|false|yes|no", re.IGNORECASE)
+# Names and values in the path of a camera's URL: /user=admin_password=secret_channel=1.
+_PATH = re.compile(
+    r"(?<=[/_,;])([a-z-]*(?:user|login|pass|psw|pw|token|secret|auth|key|sig)[a-z-]*)=[^\s/?&'\"<>),;]*?"
+    r"(?=_[a-z]+=|\.sdp|[\s/?&'\"<>),;]|$)",
     re.IGNORECASE,
 )
 # Parameters of URLs signed by S3, Google, CloudFront or Azure; a token may instead be what names a file.
@@ -39,8 +51,16 @@ def local_path(text: str) -> str:
 
 
 def hide_credentials(text: str) -> str:
-    """Replace the user, the password, and signatures and tokens in the query of each URL by ``***``."""
-    return _SECRET.sub(r"\1=***", _CREDENTIALS.sub("***@", text))
+    """Replace what may be secret in URLs by ``***``: users, passwords and unknown parameters."""
+    text = _PATH.sub(r"\1=***", _CREDENTIALS.sub("***@", text))
+    return _PARAMETER.sub(_hide_value, text)
+
+
+def _hide_value(found: re.Match[str]) -> str:
+    value, mark, fragment = found[2].partition("#")
+    if not (_HARMLESS.fullmatch(found[1]) or _SHORT.fullmatch(value)):
+        return f"{found[1]}=***"
+    return f"{found[1]}={value}{_PARAMETER.sub(_hide_value, mark + fragment)}"
 
 
 def stable_url(url: str) -> str:
@@ -71,3 +91,17 @@ def natural_key(name: str) -> tuple[list[object], str]:
 def encodable(text: str) -> str:
     r"""Return text that UTF-8 can encode: other bytes of a file name become ``\udcff`` and the like."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+# Characters that move the cursor, change colors or reverse the order of others.
+_CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+
+
+def printable(text: str) -> str:
+    r"""Return text that does nothing in a terminal: control characters become ``\x1b`` and the like."""
+    return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+def spreadsheet_text(text: str) -> str:
+    """Put an apostrophe before a name that a spreadsheet would take for a formula."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text

@@ -6,6 +6,7 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from vehicle_detection._common import Floats
@@ -73,10 +74,9 @@ def _moments(features: NDArray[np.float32], rows: NDArray[np.intp]) -> tuple[Flo
     return mean, deviation
 
 
-_reordered = functools.partial(jit, reorder=True)
-
-
-@_reordered
+# Inlined: a function would be compiled on its own and within `_descend`, with different roundings, and which
+# of the two runs would depend on the cache of kernels.
+@register_jitable(inline="always")
 def _score(row, center, weights):
     total = np.float32(0)
     for index in range(row.shape[0]):
@@ -84,7 +84,7 @@ def _score(row, center, weights):
     return total
 
 
-@_reordered
+@register_jitable(inline="always")
 def _squared_norm(row, center, squares):
     """Squared norm of the standardized row."""
     total = np.float32(0)
@@ -94,13 +94,13 @@ def _squared_norm(row, center, squares):
     return total
 
 
-@_reordered
+@register_jitable(inline="always")
 def _add(step, row, center, squares, weights):
     for index in range(row.shape[0]):
         weights[index] += step * ((row[index] - center[index]) * squares[index])
 
 
-@jit
+@functools.partial(jit, reorder=True)
 def _descend(features, rows, signs, ridge, center, squares, weights, tolerance, max_sweeps, rng):
     """Solve the dual problem: update `weights`, those of centered rows, in place and return the intercept.
 

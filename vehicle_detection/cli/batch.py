@@ -160,8 +160,10 @@ def _print_trip(trip: Mapping[str, Any]) -> None:
 def _write_summary(output: str, summary: Path | None) -> None:
     """Write the table of all trips of a batch."""
     if summary is not None:
-        from vehicle_detection._common import atomic_write
+        from vehicle_detection._common import atomic_write, spreadsheet_text
 
-        table = vd.drive.batch_summary(output)
+        table = vd.drive.batch_summary(output).map(
+            lambda cell: spreadsheet_text(cell) if isinstance(cell, str) else cell
+        )
         with atomic_write(summary, "--summary") as part:
             table.to_csv(part, index=False)

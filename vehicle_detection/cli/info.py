@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -27,7 +28,12 @@ def info(
     title, facts = loaded.summary()
     print_facts(f"{model}: {title}", facts)
     for name, values in loaded.metadata.items():
-        if name != "metrics" or not _print_metrics(values):
+        printed = False
+        with contextlib.suppress(
+            AttributeError, KeyError, OverflowError, TypeError, ValueError
+        ):  # of another shape
+            printed = name == "metrics" and _print_metrics(values)
+        if not printed:
             print_facts(name, values if isinstance(values, dict) else {"": values})
 
 

@@ -42,9 +42,12 @@ def replace_unprintable() -> None:
         sys.stdout.reconfigure(errors="replace")
 
 
-def print_line(text: str, *, err: bool = False, indent: int = 2) -> None:
+def print_line(text: str, *, err: bool = False, indent: int = 2, bold: bool = False) -> None:
     """Print a text; in a terminal, above progress bars, and wrapped at spaces with an indent."""
+    from vehicle_detection._common import printable
+
     stream = sys.stderr if err else sys.stdout
+    text = typer.style(printable(text), bold=True) if bold else printable(text)
     if (width := _terminal_width(stream)) is None:
         typer.echo(text, err=err)
         return
@@ -138,7 +141,10 @@ def print_table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]])
     from rich.console import Console
     from rich.table import Table
 
+    from vehicle_detection._common import printable
+
     terminal = _terminal_width(sys.stdout)
+    rows = [[printable(cell) for cell in row] for row in rows]
     columns = [list(column) for column in zip(heads, *rows)]
     padding, widths = _fit_columns(columns, terminal) if terminal else (1, [None] * len(columns))
     table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
@@ -170,7 +176,7 @@ def _fit_columns(columns: Sequence[Sequence[str]], width: int) -> tuple[int, lis
 
 def print_facts(title: str, facts: Mapping[str, Any]) -> None:
     """Print a title, and below it names and values in two columns."""
-    print_line(typer.style(title, bold=True))
+    print_line(title, bold=True)
     width = max(map(len, facts), default=0)
     for name, value in facts.items():
         nested = isinstance(value, Mapping)

@@ -327,8 +327,9 @@ def _parse(key: str, data: bytes) -> dict[str, Any] | None:
     sources, outputs = given.get("sources"), given.get("outputs", {})
     # The outputs of a record may be removed: they are files of this trip, and nothing else.
     output = rf"(tracks|videos)/date=[^/\\]+/camera=[^/\\]+/{re.escape(key)}\.(parquet|mp4)"
-    shaped = isinstance(sources, list) and isinstance(outputs, dict) and sources
-    whole = shaped and (
+    if not (isinstance(sources, list) and isinstance(outputs, dict) and sources):
+        return None
+    whole = (
         all(isinstance(each, dict) and isinstance(each.get("uri"), str) for each in sources)
         and all(isinstance(path, str) and re.fullmatch(output, path) for path in outputs.values())
         and all(isinstance(given.get(name, ""), str) for name in _TEXTS)

@@ -100,6 +100,8 @@ def _read_csv(source: Path, classes: Collection[str] | None) -> FileRows:
     cells: dict[str, list[Any]] = {
         name: [line[column].strip() for _, line in lines] for column, name in enumerate(names)
     }
+    if "frame" in cells:  # without the mark that keeps a spreadsheet from calculating
+        cells["frame"] = [re.sub(r"^'(?=[=+@-])", "", frame) for frame in cells["frame"]]
     if all(map(FRAME_NUMBER.fullmatch, cells.get("frame", ["no number"]))):
         cells["frame"] = [int(frame.partition(".")[0]) for frame in cells["frame"]]
     return _check_columns(source, FileRows([f"{source} line {number}" for number, _ in lines], cells))
@@ -155,7 +157,8 @@ def _read_kitti(source: Path, classes: Collection[str] | None) -> FileRows:
     rows: list[tuple[str, Record]] = []
     for file in sorted(files, key=lambda file: frame_order(file.name)):
         for where, line in read_lines(file):
-            words, place = line.split(), {"frame": file.stem}
+            words = line.split()
+            place: Record = {"frame": file.stem}
             tracked = len(words) in (17, 18) and words[0].isdecimal()  # labels of KITTI's tracking
             if tracked and len(files) > 1:
                 raise DatasetError(f"{source} holds tracks of several drives; name one of its files")

@@ -25,12 +25,12 @@ from vehicle_detection._common import (
     describe,
     is_listing,
     open_parquet,
+    spreadsheet_text,
     temporary_folder,
 )
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.formats.coco import (
-    Record,
     Truth,
     Write,
     open_coco,
@@ -39,7 +39,7 @@ from vehicle_detection.formats.coco import (
     without_noise,
 )
 from vehicle_detection.formats.read import FOLDER_FORMATS, FORMATS
-from vehicle_detection.formats.rows import FRAME_NUMBER, without_suffix
+from vehicle_detection.formats.rows import FRAME_NUMBER, Record, without_suffix
 from vehicle_detection.tables import BOX_COLUMNS, CORNERS, NO_TRACK, TRACK_COLUMNS, FrameKey, TrackTable
 from vehicle_detection.tracking import is_result, shown_tracks
 
@@ -115,6 +115,8 @@ def _open_csv(part: Path, target: _Target) -> Iterator[Write]:
     def cell(name: str, value: Any) -> Any:
         if value is None or isinstance(value, bool):
             return "" if value is None else int(value)
+        if isinstance(value, str):
+            return spreadsheet_text(value)
         return f"{value:.{digits[name]}f}" if name in digits else value
 
     with part.open("w", encoding="utf-8", newline="") as file:
@@ -513,6 +515,8 @@ def _check_holds(labels: TrackTable, kind: str, shape: tuple[int, ...] | None) -
         problem = f"labels hold predictions marked ignore, which the format {kind!r} cannot mark; {drop}"
     elif kind == "coco_results" and not scored and len(labels):
         problem = "labels need scores for COCO results; write labels as a data set ('coco')"
+    elif kind in FOLDER_FORMATS and any("\0" in str(key) for key in labels.frame_keys):
+        problem = "labels name a frame with a null byte, as no file can be called; use labels.renamed"
     elif kind == "kitti" and unnamed:
         problem = (
             f"labels must have frames that are file names for KITTI, got {unnamed[0]!r}; "

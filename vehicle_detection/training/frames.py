@@ -129,7 +129,7 @@ def _read_frames(root: Path, file: Path, clip_rate: float) -> LabelledFrames:
                     "are %d images without labels",
                     *(file, len(absent), len(named), folder, absent[0], len(unlabelled)),
                 )
-                kept = tuple(key for key in found.keys if key in named)
+                kept = tuple(str(key) for key in found.keys if key in named)
                 return LabelledFrames(name, FrameSet(folder, kept), labels)
             return found
     videos = [path for path in (root / "videos").glob(f"{glob.escape(name)}.*") if is_video_file(path)]

@@ -151,9 +151,13 @@ class RowStore(dict[str, Mapping[str, Any]]):
             return
         text = _complete_lines(self._path)
         header, rows = _parse(text, self._path, self._suffix)
-        if header and tuple(header) != self._columns:
+        start = (
+            _csv_line(self._columns) if self._suffix == ".csv" else json.dumps({self._columns[0]: ""})[:-3]
+        )
+        head = self._path.read_bytes()[: len(start)].removeprefix(b"\xef\xbb\xbf")
+        if not start.encode().startswith(head) or (header and tuple(header) != self._columns):
             raise DatasetError(
-                f"store {self._path} has other columns than this release writes; choose another file"
+                f"store {self._path} is not a table of trials, or of another release; choose another file"
             )
         # Remove an incomplete last line: the next row would be appended to it.
         os.truncate(self._path, len(text.encode("utf-8")))

@@ -49,17 +49,41 @@ NETWORK_DEADLINE = 60.0
 """Seconds after which a server has failed that sends too little for a frame, or for the start of a video."""
 
 
+# Formats that hold a video or a sound. Others, such as lists and manifests, name further files to read.
+_FORMATS = (
+    "mov,matroska,avi,mpegts,mpegtsraw,mpeg,mpegvideo,flv,live_flv,asf,ogg,mxf,gxf,nut,wtv,rm,dv,dhav,nsv,kux,mtv,"
+    "h261,h263,h264,hevc,vvc,m4v,av1,obu,ivf,vc1,avs2,avs3,mjpeg,mjpeg_2000,mpjpeg,rawvideo,yuv4mpegpipe,gif,apng,"
+    "webp_anim,jpeg_pipe,png_pipe,bmp_pipe,webp_pipe,tiff_pipe,wav,mp3,aac,ac3,flac,aiff"
+)
+_NETWORK = (
+    "http,https,httpproxy,tls,tcp,udp,rtp,srtp,srt,crypto,rtmp,rtmps,rtmpt,rtmpts,rtmpe,rtmpte,ffrtmphttp,"
+    "ffrtmpcrypt"
+)
+
+
+def restrict_input(protocols: str, formats: str = "") -> tuple[str, ...]:
+    """Return the options of ffmpeg that let its next input open files or servers by some protocols only."""
+    return ("-protocol_whitelist", protocols, "-format_whitelist", _FORMATS + formats)
+
+
 def input_options(path: Path | str) -> tuple[str, ...]:
     """Return the options of ffmpeg that open a file, or a URL, whose connection is repaired if it breaks."""
     if isinstance(path, Path):
-        return ("-i", f"file:{path}")
+        return (*restrict_input("file"), "-i", f"file:{path}")
     limit = ("-rw_timeout", f"{NETWORK_TIMEOUT * 1e6:.0f}")
-    return (*limit, "-reconnect", "1", "-reconnect_delay_max", "4", "-i", path)
+    return (*limit, "-reconnect", "1", "-reconnect_delay_max", "4", *network_options(path))
+
+
+def network_options(url: str) -> tuple[str, ...]:
+    """Return the options of ffmpeg that open a URL, which may be that of a playlist at an HTTP server."""
+    playlists = url.lower().startswith(("http://", "https://"))
+    formats = ",hls,dash" if playlists else ",rtsp,rtp"
+    return (*restrict_input(_NETWORK + ",data" * playlists, formats), "-i", url)
 
 
 def source_name(path: Path | str) -> str:
     """Name of a file or URL in messages."""
-    return str(path) if isinstance(path, Path) else hide_credentials(path)
+    return str(path) if isinstance(path, Path) else hide_credentials(path.replace(" ", "%20"))
 
 
 SQUARE_PIXELS = "scale=w='if(gt(abs(sar-1),0.02)*between(sar,1/3,3),round(iw*sar/2)*2,iw)':h=ih"

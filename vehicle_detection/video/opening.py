@@ -23,7 +23,13 @@ from vehicle_detection._common import (
     temporary_folder,
 )
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video.ffmpeg import NETWORK_TIMEOUT, input_options, source_name
+from vehicle_detection.video.ffmpeg import (
+    NETWORK_TIMEOUT,
+    input_options,
+    network_options,
+    restrict_input,
+    source_name,
+)
 from vehicle_detection.video.files import IMAGE_SUFFIXES, check_file, is_video_file, list_files
 from vehicle_detection.video.live import LiveStream
 from vehicle_detection.video.probe import VideoInfo, probe
@@ -250,7 +256,10 @@ def _open_stdin(options: _Options) -> FrameSource:
         raise InvalidInputError(
             "source - reads a video from standard input, which is not a pipe; use: cat drive.mp4 | ..."
         )
-    return Stream(options.open_stream("-", ("-i", "pipe:0"), descriptor), live=bool(options.live))
+    return Stream(
+        options.open_stream("-", (*restrict_input("pipe"), "-i", "pipe:0"), descriptor),
+        live=bool(options.live),
+    )
 
 
 def _open_camera(name: str, options: _Options) -> FrameSource:
@@ -277,7 +286,7 @@ def _open_url(url: str, scheme: str, options: _Options) -> FrameSource:
             return VideoFile(url, options.check(url, info))
     elif scheme not in _STREAM_SCHEMES:
         return _download(url, options)
-    settings = (*(_RTSP_OPTIONS if scheme.startswith("rtsp") else ()), "-i", url)
+    settings = (*(_RTSP_OPTIONS if scheme.startswith("rtsp") else ()), *network_options(url))
     opened = options.open_stream(source_name(url), settings, network=True)
     return Stream(opened, live=options.live is not False)
 

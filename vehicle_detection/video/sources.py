@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import Closing, temporary_folder
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.images import read_image
-from vehicle_detection.video.ffmpeg import input_options, source_name
+from vehicle_detection.video.ffmpeg import input_options, restrict_input, source_name
 from vehicle_detection.video.files import IMAGE_SUFFIXES
 from vehicle_detection.video.live import LiveStream
 from vehicle_detection.video.probe import VideoInfo
@@ -234,7 +234,8 @@ class VideoSegments(FrameSource):
             text.encode("utf-8", "surrogateescape")
         )  # a path that is not UTF-8 keeps its bytes
         # Times as in the list: the first sound may lie before 0, which ffmpeg would take for the start.
-        options = ("-seek_timestamp", "1", "-f", "concat", "-safe", "0", "-i", f"file:{listing}")
+        options: tuple[str, ...] = ("-seek_timestamp", "1", "-f", "concat", "-safe", "0")
+        options += (*restrict_input("file", ",concat"), "-i", f"file:{listing}")
         return AudioSource(input=options, start=float(first / self.info.fps), length=length)
 
 
