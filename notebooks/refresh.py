@@ -26,7 +26,7 @@ from nbclient import NotebookClient
 HERE = Path(__file__).resolve().parent
 GALLERY = HERE.parent / "docs" / "gallery"
 
-MAX_SECONDS = 150
+MAX_SECONDS = 240
 MAX_BYTES = 1_500_000
 """Limits of the run time and the file size of a notebook."""
 

@@ -30,7 +30,7 @@ def texts_in(cell):
 
 
 def test_the_notebooks_are_numbered():
-    assert [path.name[:2] for path in NOTEBOOKS] == [f"{number:02}" for number in range(1, 11)]
+    assert [path.name[:2] for path in NOTEBOOKS] == [f"{number:02}" for number in range(1, 12)]
 
 
 @EACH

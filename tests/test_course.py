@@ -746,7 +746,7 @@ def test_every_call_form_binds(call_data, form, shape):
         ("color_hist(d.patch, 4, (5, 5))", "bins_range must be a number, greater than 5"),
         ("color_hist(d.patch, 4, 256)", "bins_range must be .low, high."),
         ("color_hist(d.patch.astype(int))", "must be uint8 or float"),
-        ("convert_color(d.patch, 'RGB2CMYK')", "conv must be"),
+        ("convert_color(d.patch, 'RGB2CMYK')", "conv or color_space must be"),
         ("extract_features('car.png')", "list of file names"),
         ("extract_features(d.patch)", r"list of images, .*pass \[image\], or use single_img_features"),
         ("extract_features([d.patch, d.gray])", r"imgs\[1\] must be an .H, W, 3. RGB array"),

@@ -211,6 +211,7 @@ def test_it_finds_the_vehicles_of_the_courses_images(real_data):
         ({"cells_per_step": 0}, "cells_per_step must be an integer"),
         ({"n_frames": 0}, "n_frames must be an integer"),
         ({"threshold": -1}, "threshold must be a number"),
+        ({"smoother": 3}, "smoother must be"),
         ({"method": 3}, "method must be one of 1, 2"),
     ],
 )

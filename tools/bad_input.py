@@ -324,6 +324,7 @@ class _Valid:
             "calibrate_scores": {"labels": [1, 0]},
             "calibration_error": {"probabilities": [0.2, 0.5], "labels": [0, 1], "bins": 5},
             "compare_configurations": {"configurations": {"a": params}, "options": quick},
+            "compare_searches": {"frames": frames, "scales": [(1.0,)], "overlaps": [0.5], "thresholds": [1]},
             "detector_from": {"function": lambda image: (boxes, scores)},
             "draw_labeled_bboxes": {"labels": (heat.astype(np.int32), 0)},
             "course.Box.add": {"box": ((0, 0), (9, 9))},
@@ -333,6 +334,9 @@ class _Valid:
             "course.search_windows": {**lesson_only, "color_space": "RGB", "orient": 4},
             "course.draw_labeled_bboxes": {"labels": (heat.astype(np.int32), 0)},
             "course.get_hog_features": {"img": image[..., 0]},
+            "course.bounding_boxes": {"windows": boxes},
+            "course.show_images": {"titles": ["a"]},
+            "course.process_image": {"method": 2},
             "estimate_horizon": {"boxes": [[40 * n, 60, 30 + 40 * n + n, 90 + n] for n in range(1, 7)]},
             "evaluate_detections": {"labels": truth},
             "evaluate_distances": {"labels": truth},
@@ -400,7 +404,8 @@ def _table() -> Any:
 
 
 _OTHER_NAMES = {
-    "clf": "classifier", "cost": "column", "X_scaler": "scaler", "svc": "classifier", "by": "column",
+    "clf": "classifier|model file|path", "cost": "column", "X_scaler": "scaler", "svc": "classifier",
+    "by": "column",
     "frames": "frame", "label": "column", "n_frames": "frames", "parameter": "column", "path": "file|folder",
     "quality": "column", "configurations": "configuration|preset", "image": "path|frame",
     "frame": "img|image", "patches": "image file", "windows": "boxes|bbox_list", "X": "source",

@@ -63,7 +63,7 @@ SUBPACKAGE_NAMES = {
     "search": "SearchResult",
     "tracking": "HorizonEstimate SceneCuts",
     "training": (
-        "compare_configurations FrameDataset mine_negatives pareto_front "
+        "compare_configurations compare_searches FrameDataset mine_negatives pareto_front "
         "PatchFeatures read_results search_parameters TrainingReport TrialOptions"
     ),
     "video": "FrameSource TrackRun VideoReport",

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from vehicle_detection._common import check_image, check_integer, check_number
+from vehicle_detection._common import check_image, check_integer, check_number, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.course.methods import FindWindows, read_bands, window_search
 from vehicle_detection.course.smoothing import BoxSmoother
@@ -23,6 +23,7 @@ from vehicle_detection.course.windows import (
     labeled_bboxes,
     show_images,
 )
+from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import label_boxes
 
 
@@ -90,6 +91,8 @@ class HeatmapDetector:
         self.find_windows: FindWindows = window_search(clf, scaler, method, bands, options)
         self.threshold = check_number(float(method) if threshold is None else threshold, "threshold", low=0)
         self.history: deque[NDArray[Any]] = deque(maxlen=check_integer(n_frames, "n_frames", low=1))
+        if smoother is not None and not callable(smoother):
+            raise InvalidInputError(f"smoother must be a BoxSmoother or a function; got {describe(smoother)}")
         self.smoother = smoother
         self.windows: Any = []
         self.heatmap: Any = None

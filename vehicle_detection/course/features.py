@@ -115,8 +115,8 @@ def convert_color(img: Image, conv: str = "RGB2YCrCb", *, color_space: str | Non
     source, target = (_OPENCV_SPACES.get(name) for name in (names[0] or "RGB", names[2]))
     if source in (None, "GRAY") or target is None or {source, target}.isdisjoint({"RGB", "BGR"}):
         raise InvalidInputError(
-            f"conv must be RGB2 or BGR2 and one of {', '.join(_OPENCV_SPACES.values())}, or an inverse such "
-            f"as HSV2RGB; got {describe(conv)}"
+            f"conv or color_space must be RGB2 or BGR2 and one of {', '.join(_OPENCV_SPACES.values())}, or "
+            f"an inverse such as HSV2RGB; got {describe(conv)}"
         )
     if source == target:
         return image.copy()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable, Sequence
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ def read_bands(scales: Sequence[Any], rows: tuple[int, int]) -> list[_Band]:
     for each in check_sequence(scales, "scales", "numbers"):
         scale, *own = each if isinstance(each, tuple) else (each,)
         pairs = [*own, *usual[len(own) :]]
-        if any(np.shape(pair) != (2,) or not 0 <= pair[0] < pair[1] for pair in pairs) or len(pairs) > 2:
+        if len(pairs) > 2 or not all(_is_range(pair) for pair in pairs):
             raise InvalidInputError(
                 "scales must hold numbers, or (scale, (ystart, ystop), (xstart, xstop)) with start < stop; "
                 f"got {describe(each)} and the rows {rows}"
@@ -55,6 +56,11 @@ def read_bands(scales: Sequence[Any], rows: tuple[int, int]) -> list[_Band]:
     if not bands:
         raise InvalidInputError("scales must hold a number at least, such as (1.0, 1.5); got none")
     return bands
+
+
+def _is_range(pair: Any) -> bool:
+    numbers = isinstance(pair, (tuple, list)) and all(isinstance(each, Real) for each in pair)
+    return numbers and len(pair) == 2 and 0 <= pair[0] < pair[1] <= 1e5
 
 
 def window_search(

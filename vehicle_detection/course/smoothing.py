@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, check_number
+from vehicle_detection._common import check_bool, check_integer, check_number, describe
 from vehicle_detection.course.windows import Corners, corner_array
+from vehicle_detection.errors import InvalidInputError
 
 Floats = NDArray[np.float64]
 
@@ -32,7 +33,7 @@ class Box:
 
     def add(self, box: Any) -> Corners:
         """Add the box of another frame, a pair of corners, and return the weighted mean."""
-        self.boxes.append(corner_array([box], "box")[0].astype(np.float64))
+        self.boxes.append(_one_box(box, "box"))
         return _corners(np.average(self.boxes, axis=0, weights=np.arange(1, len(self.boxes) + 1)))
 
 
@@ -44,8 +45,15 @@ def adjust_bbox(bbox: Any, previous: Any, weight: float = 0.3) -> Corners:
     >>> adjust_bbox(((20, 0), (60, 40)), ((10, 0), (50, 40)), weight=0.5)
     ((15, 0), (55, 40))
     """
-    new, old = corner_array([bbox, previous], "bbox and previous").astype(np.float64)
+    new, old = _one_box(bbox, "bbox"), _one_box(previous, "previous")
     return _corners(old + check_number(weight, "weight", above=0, high=1) * (new - old))
+
+
+def _one_box(box: Any, name: str) -> Floats:
+    boxes = corner_array([box], name).astype(np.float64)
+    if not len(boxes):
+        raise InvalidInputError(f"{name} must be a pair of corners ((x1, y1), (x2, y2)); got {describe(box)}")
+    return boxes[0]
 
 
 def _corners(box: Floats) -> Corners:
@@ -89,7 +97,7 @@ class BoxSmoother:
         self, *, weight: float = 1.0, hold: int = 0, estimate: bool = False, show_after: int = 1
     ) -> None:
         self.weight = check_number(weight, "weight", above=0, high=1)
-        self.hold, self.estimate = check_integer(hold, "hold", low=0), bool(estimate)
+        self.hold, self.estimate = check_integer(hold, "hold", low=0), check_bool(estimate, "estimate")
         self.show_after = check_integer(show_after, "show_after", low=1)
         self.vehicles: list[_Vehicle] = []
 

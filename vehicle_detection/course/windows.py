@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import heatmap as library
-from vehicle_detection._common import check_array, check_choice, check_integer, check_number, describe
+from vehicle_detection._common import (
+    check_array,
+    check_choice,
+    check_integer,
+    check_number,
+    check_sequence,
+    describe,
+)
 from vehicle_detection.course.features import Image, check_lesson_image
 from vehicle_detection.course.versions import FORMULAS, lesson_function
 from vehicle_detection.errors import InvalidInputError
@@ -240,7 +247,7 @@ def bounding_boxes(image: Image, windows: Any, threshold: float = 1) -> list[Cor
     """
     from scipy.ndimage import label
 
-    heat = add_heat(np.zeros(image.shape[:2]), windows)
+    heat = add_heat(np.zeros(check_lesson_image(image, "image").shape[:2]), windows)
     return labeled_bboxes(label(apply_threshold(heat, threshold)))
 
 
@@ -248,7 +255,11 @@ def show_images(images: Sequence[Image], titles: Sequence[str] = (), columns: in
     """Show images in a grid with matplotlib's pyplot: RGB, or ``(H, W)`` in a color map."""
     import matplotlib.pyplot as plt
 
-    rows, columns = -(-len(images) // columns), min(columns, len(images))
+    for image in (images := check_sequence(images, "images", "images")):
+        if not isinstance(image, np.ndarray) or image.ndim != 2:
+            check_lesson_image(image, "each of the images")
+    columns = min(check_integer(columns, "columns", low=1), len(images) or 1)
+    rows, titles = -(-len(images) // columns) or 1, check_sequence(titles, "titles", "texts")
     panels = plt.subplots(rows, columns, figsize=(6 * columns, 3.6 * rows), squeeze=False)[1].ravel()
     for panel, image in zip(panels, images):
         panel.imshow(image, cmap="hot" if image.ndim == 2 else None)

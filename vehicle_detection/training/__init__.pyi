@@ -41,6 +41,7 @@ from .results import numeric_column as numeric_column
 from .results import pareto_front as pareto_front
 from .results import read_results as read_results
 from .results import write_results as write_results
+from .searches import compare_searches as compare_searches
 from .trials import TrialOptions as TrialOptions
 from .trials import expand_grid as expand_grid
 from .trials import parse_grid as parse_grid

@@ -1,0 +1,105 @@
+"""Windows, overlaps and heat thresholds of the course's search, compared on labelled frames."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from vehicle_detection._common import check_number, check_sequence, check_type
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import LabelledFrames, evaluate_detections
+from vehicle_detection.features import PATCH_SIZE
+from vehicle_detection.heatmap import HeatParams, bounding_boxes
+from vehicle_detection.search import SearchBand, SearchParams
+from vehicle_detection.svm import CLASSIFIER_REMEDY, VehicleClassifier
+from vehicle_detection.tables import TrackTable
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def compare_searches(
+    classifier: VehicleClassifier,
+    frames: LabelledFrames,
+    *,
+    scales: Sequence[Sequence[float]] = ((1.0,), (1.0, 1.5), (0.8, 1.0, 1.5)),
+    overlaps: Sequence[float] = (0.5, 0.75, 0.875),
+    thresholds: Sequence[float] = (0, 1, 2, 4, 8, 16, 32),
+    horizon: float = 400 / 720,
+) -> pd.DataFrame:
+    """Search labelled frames with all combinations of windows, overlap and heat threshold.
+
+    Returns a table with a row for each combination, best F1 first: ``scales``, ``overlap``, ``threshold``,
+    ``f1``, ``recall``, ``precision``, ``mean_iou``, and ``ms``, the time of the search per frame.
+
+    Parameters
+    ----------
+    classifier, frames
+        The trained model, and frames with their boxes.
+    scales, overlaps, thresholds
+        Sets of sides of windows divided by 64 pixels, in a frame whose longer side is 1280; overlaps of
+        neighbors as a fraction; and the number of windows that a pixel must exceed.
+    horizon
+        As in `SearchParams`; the windows lie in the 256 rows below it.
+
+    Examples
+    --------
+    >>> from vehicle_detection import load_classifier, render_scene
+    >>> from vehicle_detection.scenes import truth_table
+    >>> scene = render_scene(shape=(540, 960), random_state=1)
+    >>> frames = LabelledFrames("scene", [scene.image], truth_table({0: scene.truth}))
+    >>> table = compare_searches(load_classifier(), frames, overlaps=[0.75], thresholds=[1, 4])
+    >>> len(table), list(table.columns[:4])
+    (6, ['scales', 'overlap', 'threshold', 'f1'])
+    """
+    import pandas as pd
+
+    check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+    check_type(frames, "frames", LabelledFrames, "pass LabelledFrames(name, images, labels)")
+    sets = [
+        [
+            check_number(side, "scales", low=0.25, high=20)
+            for side in check_sequence(each, "scales", "numbers")
+        ]
+        for each in check_sequence(scales, "scales", "sets of numbers")
+    ]
+    limits = [
+        check_number(each, "thresholds", low=0)
+        for each in check_sequence(thresholds, "thresholds", "numbers")
+    ]
+    shares = [
+        check_number(each, "overlaps", low=0, high=0.99)
+        for each in check_sequence(overlaps, "overlaps", "numbers")
+    ]
+    rows = []
+    for sides, overlap in itertools.product(sets, shares):
+        bands = [
+            SearchBand(window=(PATCH_SIZE * side,) * 2, y=(0.0, 256.0), overlap=(overlap, overlap))
+            for side in sides
+        ]
+        params = SearchParams(bands=tuple(bands), horizon=horizon)
+        with classifier.open_search() as search:
+            start = time.perf_counter()
+            windows = {key: search.find_windows(image, params) for key, image in frames}
+            seconds = (time.perf_counter() - start) / max(1, len(windows))
+        shapes = {key: image.shape for key, image in frames}
+        for limit in limits:
+            heat = HeatParams(weighting="count", threshold=limit, peak_fraction=0)
+            found = {key: bounding_boxes(shapes[key], each, params=heat) for key, each in windows.items()}
+            scores = evaluate_detections(TrackTable.from_detections(found), frames.labels, frames=frames.keys)
+            names = ("f1", "recall", "precision", "mean_iou")
+            values = {name: getattr(scores, name) for name in names}
+            rows.append(
+                {
+                    "scales": tuple(sides),
+                    "overlap": overlap,
+                    "threshold": limit,
+                    **values,
+                    "ms": 1000 * seconds,
+                }
+            )
+    if not rows:
+        raise InvalidInputError("scales, overlaps and thresholds must hold a value each; got an empty list")
+    return pd.DataFrame(rows).sort_values("f1", ascending=False, kind="stable", ignore_index=True)
