@@ -998,6 +998,15 @@ def test_the_nearer_of_two_nested_boxes_with_equal_scores_is_tracked(order):
     np.testing.assert_allclose(track.box, near, atol=3)
 
 
+def test_a_box_beside_a_coasting_track_is_another_vehicle():
+    tracker = after(25)
+    for _ in range(10):
+        tracker.update(found(), SHAPE)
+    for _ in range(10):
+        tracks = tracker.update(found([705.0, 400, 805, 490]), SHAPE)
+    assert [track.id for track in tracks if track.state == "confirmed"] == [2]
+
+
 def assert_equal(first, second):
     for one, other in zip(first, second, strict=True):
         for field in dataclasses.fields(Track):

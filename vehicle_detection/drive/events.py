@@ -75,9 +75,9 @@ _CLOSING_TIME, _HARD_TIME, _HARD_DECELERATION, _MIN_CLOSING = 4.0, 2.5, 3.0, 0.3
 # Time (s) for which a vehicle is seen before and after its closest approach; else a smaller distance may have
 # been missed.
 _MIN_AROUND = 0.5
-# Longest duration (s) of a lane change, and largest lateral speed (m/s) of a vehicle that changes the lane or
-# passes: crossing vehicles, and all vehicles while the camera turns, are faster.
-_LANE_CHANGE, _MAX_LATERAL_SPEED = 6.0, 3.0
+# Longest duration (s) of a lane change; and largest lateral speed (m/s; or a part of the closing speed) of
+# what neither crosses the road nor is seen from a camera that turns.
+_LANE_CHANGE, _MAX_LATERAL_SPEED, _MAX_SLOPE = 6.0, 3.0, 0.25
 # A passing vehicle's middle leaves the frame at most this long (s) after the vehicle was last seen, or enters
 # it at most this long before it was first seen; and the least change of its distance.
 _UNSEEN_TIME, _PASSING_RATIO = 0.5, 1.15
@@ -389,10 +389,10 @@ class _Finder:
             return
         # Columns are proportional to the reciprocal distance, so that its middle reaches the border then.
         unseen = time * (1 - motion.outward[last]) - (motion.seconds[-1] - motion.seconds[last])
-        unseen = 0.0 if motion.at_side[last:].any() else unseen
-        left = (self.scene[1] - frames[-1]) / self.fps  # time of the scene after the track
+        after = (self.scene[1] - frames[-1]) / self.fps  # time of the scene after the track
+        leaves = motion.at_side[last:].any() or unseen <= min(_UNSEEN_TIME, after)
         grown = np.nanmax(motion.distance[first : last + 1]) / motion.distance[last]
-        if grown < _PASSING_RATIO or not left or unseen > min(_UNSEEN_TIME, left):
+        if grown < _PASSING_RATIO or not (after and leaves):
             return
         closing, closing_std = (float(np.median(each[rows])) for each in (motion.closing, motion.closing_std))
         kind, certainty = self._passing_kind(closing, closing_std, int(frames[last]))
@@ -414,16 +414,17 @@ class _Finder:
             return
         since = -time[row] - (motion.seconds[row] - motion.seconds[first])  # it was beside the camera
         unseen = since * (1 - motion.outward[first]) - (motion.seconds[first] - motion.seconds[0])
-        unseen = 0.0 if motion.at_side[: first + 1].any() else unseen
-        shrunk = motion.distance[last] / motion.distance[near]
-        if shrunk >= _PASSING_RATIO and unseen <= min(_UNSEEN_TIME, (frames[0] - self.scene[0]) / self.fps):
+        before = (frames[0] - self.scene[0]) / self.fps  # time of the scene before the track
+        came_in = motion.at_side[: first + 1].any() or (since > 0 and unseen <= min(_UNSEEN_TIME, before))
+        if came_in and motion.distance[last] / motion.distance[near] >= _PASSING_RATIO:
             certainty = _probability(1.0, motion.slope_error[row])
             yield self._event("overtook_us", near, 0, stop, certainty, side=self._side(first), speed_row=row)
 
     def _goes_straight(self, row: int, rows: NDArray[np.intp]) -> bool:
-        """Whether the vehicle is beside the camera's lane at a row, and does not cross the road at others."""
+        """Whether the vehicle is beside the camera's lane at a row, and crosses no road at others."""
         beside = abs(self.motion.lateral[row]) > 0.7 * LANE_HALF_WIDTH_M
-        crosses = np.abs(self.motion.lateral_rate[rows]) > _MAX_LATERAL_SPEED  # False where unknown
+        limit = np.fmax(_MAX_LATERAL_SPEED, _MAX_SLOPE * np.abs(self.motion.closing[rows]))
+        crosses = np.abs(self.motion.lateral_rate[rows]) > limit  # False where unknown
         return bool(beside and crosses.mean() < 0.5)
 
     def _passing_kind(self, closing: float, std: float, frame: int) -> tuple[Kind, float]:

@@ -34,7 +34,7 @@ Bools = NDArray[np.bool_]
 
 
 def match_boxes(
-    predicted: Floats, measured: Floats, max_distance: Floats, min_iou: float = 0.0
+    predicted: Floats, measured: Floats, max_distance: Floats, min_iou: float | Floats = 0.0
 ) -> list[tuple[int, int]]:
     """Pairs ``(predicted, measured)`` of indices by the Hungarian method, with minimum total cost.
 

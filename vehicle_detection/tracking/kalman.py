@@ -238,7 +238,7 @@ class NearestSmoother(HistorySmoother):
 
     @staticmethod
     def match(
-        predicted: Floats, measured: Floats, max_distance: Floats, min_iou: float = 0.0
+        predicted: Floats, measured: Floats, max_distance: Floats, min_iou: float | Floats = 0.0
     ) -> list[tuple[int, int]]:
         """Pairs of indices with at least this IoU, by the distance of the centers alone, nearest first."""
         pairs: list[tuple[int, int]] = []

@@ -64,6 +64,9 @@ _TENTATIVE_DISTANCE, _LOW_SCORE_DISTANCE = 0.6, 0.5
 # Smallest IoU of a confirmed track with a low-score detection, that of ByteTrack's code: a box that also
 # covers the lamp post above a vehicle says nothing about its height.
 _LOW_SCORE_IOU = 0.5
+# Smallest IoU of a track that was not detected in the last frame with a detection: one beside it shows
+# another vehicle.
+_COASTING_IOU = 0.1
 # Difference of the scores of two tracks on one vehicle from which on the lower one shows a part of it.
 _PART_GAP = 2.0
 # Seconds without a detection after which `max_distance` stops growing.
@@ -273,7 +276,7 @@ class Tracker:
     def _assign(
         self, boxes: Floats, scores: Floats, frame: FrameShape
     ) -> tuple[dict[int, int], dict[int, int], set[int]]:
-        """Assign detections (best first) to tracks in four rounds.
+        """Assign detections (best first) to tracks in five rounds.
 
         Returns the detection of each track, the merged detection of each track without one, and the tracks
         whose own detection is merged.
@@ -286,20 +289,31 @@ class Tracker:
         gaps = [min(track.time_since_update, _MAX_GAP) for track in self._live]
         factors = np.array([1.0 if track.id else _TENTATIVE_DISTANCE for track in self._live]) + gaps
         max_distance = params.max_distance * factors
-        # 1. Confirmed tracks with high-score detections.
+        # 1. Confirmed tracks that were detected in the last frame, or hidden, with high-score detections.
         high = int((scores >= params.high_threshold).sum())
-        own = dict(match(predicted[:confirmed], boxes[:high], max_distance[:confirmed]))
-        merged, shared = merged_detections(predicted[:confirmed], boxes[:high], own)
-        # 2. Remaining confirmed tracks with low-score detections.
+        lost = [track.misses > 0 and not track.hidden for track in self._live]
+        rows = [row for row in range(confirmed) if not lost[row]]
+        pairs = match(predicted[rows], boxes[:high], max_distance[rows])
+        own = {rows[row]: column for row, column in pairs}
+        # 2. Lost tracks, which must overlap them, and tentative ones with the other ones.
+        rows = [row for row in range(len(self._live)) if lost[row] or row >= confirmed]
+        columns = sorted({*range(high)} - {*own.values()})
+        min_iou = np.array([_COASTING_IOU if row < confirmed else 0.0 for row in rows])[:, None]
+        for row, column in match(predicted[rows], boxes[columns], max_distance[rows], min_iou):
+            own[rows[row]] = columns[column]
+        of_confirmed = {row: column for row, column in own.items() if row < confirmed}
+        merged, shared = merged_detections(predicted[:confirmed], boxes[:high], of_confirmed)
+        # 3. Remaining confirmed tracks with low-score detections.
         rows = [row for row in range(confirmed) if row not in own and row not in shared]
         near = _LOW_SCORE_DISTANCE * max_distance[rows]
         for row, column in match(predicted[rows], boxes[high:], near, _LOW_SCORE_IOU):
             own[rows[row]] = high + column
-        # 3. Tentative tracks with all remaining detections.
-        columns = sorted({*range(len(boxes))} - {*own.values()})
-        for row, column in match(predicted[confirmed:], boxes[columns], max_distance[confirmed:]):
-            own[confirmed + row] = columns[column]
-        # 4. Tentative tracks, whose speed is not known, with sure detections of approaching vehicles. Unsure
+        # 4. Remaining tentative tracks with low-score detections.
+        columns = sorted({*range(high, len(boxes))} - {*own.values()})
+        rows = [row for row in range(confirmed, len(self._live)) if row not in own]
+        for row, column in match(predicted[rows], boxes[columns], max_distance[rows]):
+            own[rows[row]] = columns[column]
+        # 5. Tentative tracks, whose speed is not known, with sure detections of approaching vehicles. Unsure
         # ones may be of what stands beside the road, which comes nearer, too.
         sure = int((scores >= params.instant_confirm_score).sum())
         columns = sorted({*range(sure)} - {*own.values()})
