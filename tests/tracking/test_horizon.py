@@ -246,3 +246,12 @@ def test_truncated_boxes_are_ignored():
 def test_too_few_boxes_are_rejected():
     with pytest.raises(InvalidInputError, match=r"^boxes must contain 4 vehicles .* got 3; use more frames"):
         estimate_horizon(boxes_on_a_road(0.5, 1.3, 3), FRAME)
+
+
+def test_a_known_height_of_the_camera_improves_the_estimate():
+    boxes = boxes_on_a_road(0.5, 2.2, 8, seed=1)
+    guessed, known = estimate_horizon(boxes, FRAME), estimate_horizon(boxes, FRAME, height_m=2.2)
+    assert abs(known.horizon - 0.5) < abs(guessed.horizon - 0.5)
+    assert known.horizon_std < guessed.horizon_std
+    with pytest.raises(InvalidInputError, match="height_m"):
+        estimate_horizon(boxes, FRAME, height_m=0)

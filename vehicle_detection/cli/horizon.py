@@ -49,14 +49,23 @@ def parse_horizon(text: str) -> float:
         ) from None
 
 
-def find_horizon(
-    source: FrameSource, model: Any, *, conf: float | None, quiet: bool, **span: float | None
-) -> float | None:
-    """Estimate the horizon of a video from its vehicles, and print the result."""
+def with_found_horizon(
+    camera: vd.Camera,
+    source: FrameSource,
+    model: Any,
+    *,
+    conf: float | None,
+    quiet: bool,
+    **known: float | None,
+) -> vd.Camera:
+    """Return the camera with the horizon that the vehicles of a video show, and its error; print both.
+
+    The camera's height and the time range are `known`, or None.
+    """
     from vehicle_detection.video import estimate_video_horizon
 
     with search_everywhere(model, conf) as detector:
-        found = estimate_video_horizon(source, detector, **span)
+        found = estimate_video_horizon(source, detector, **known)
     if found is None and not quiet:
         print_error(
             "warning: --horizon auto: too few vehicles to estimate the horizon; searching near the middle"
@@ -65,4 +74,8 @@ def find_horizon(
         print_line(
             f"horizon {found.horizon:.3f} (standard error {found.horizon_std:.3f}, {found.n_boxes} boxes)"
         )
-    return None if found is None else found.horizon
+    if found is None:
+        return camera
+    # A model that searches rows near the horizon only has to trust the estimate.
+    is_band = hasattr(model.search_params_type.default(), "horizon")
+    return camera.with_horizon(found.horizon, min(found.horizon_std, 0.02 if is_band else 1.0))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 import vehicle_detection as vd
-from vehicle_detection.cli.horizon import find_horizon, is_limited, search_everywhere, warn_of_horizon
+from vehicle_detection.cli.horizon import is_limited, search_everywhere, warn_of_horizon, with_found_horizon
 from vehicle_detection.cli.options import check_blur, open_model, takes
 from vehicle_detection.cli.output import (
     DAMAGED,
@@ -153,8 +153,10 @@ def _open(options: VideoOptions) -> Iterator[tuple[FrameSource, vd.VehicleDetect
             with vd.VehicleDetector(model, conf=options.conf, camera=camera, annotator=annotator) as unsure:
                 camera.for_shape(source.info.shape)
                 _check_run(options, source, unsure)
-            horizon = find_horizon(source, model, conf=options.conf, quiet=options.quiet, **options.span())
-            camera = camera if horizon is None else camera.with_horizon(horizon)
+            known = {"height_m": options.camera_height, **options.span()}
+            camera = with_found_horizon(
+                camera, source, model, conf=options.conf, quiet=options.quiet, **known
+            )
         with vd.VehicleDetector(model, conf=options.conf, camera=camera, annotator=annotator) as detector:
             yield source, detector
 

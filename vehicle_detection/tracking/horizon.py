@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import Floats, check_boxes, check_shape
+from vehicle_detection._common import Floats, check_boxes, check_number, check_shape
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera, FrameShape, lateral_offsets, truncated_edges
 from vehicle_detection.errors import InvalidInputError
@@ -27,8 +27,9 @@ _OUTLIER, _MIN_WEIGHT = 3.0, 1e-4
 _MIN_STD_PX = 1.0
 # The following constants are those of `estimate_horizon`. Number of boxes required.
 _MIN_BOXES = 4
-# Prior of the camera's height (m), and its standard deviation.
-_CAMERA_HEIGHT, _CAMERA_HEIGHT_STD = 1.35, 0.3
+# Prior of the camera's height (m), and its standard deviation; error of a given height, as a fraction, which
+# is mostly that of the vehicles' mean height.
+_CAMERA_HEIGHT, _CAMERA_HEIGHT_STD, _GIVEN_HEIGHT_STD = 1.35, 0.3, 0.06
 # Prior standard deviation of the horizon around the middle row, as a fraction of the frame's height.
 _PRIOR_STD = 0.15
 # Standard error of a bottom edge in pixels of a frame 1280 wide.
@@ -160,13 +161,16 @@ class HorizonEstimate:
     n_boxes: int
 
 
-def estimate_horizon(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> HorizonEstimate:
+def estimate_horizon(
+    boxes: Detections | ArrayLike, shape: tuple[int, ...], *, height_m: float | None = None
+) -> HorizonEstimate:
     """Estimate the height of the horizon from the boxes of vehicles, of one frame or of many.
 
     At least 4 boxes must not be truncated. Their height is used, because the width includes the side of a
-    vehicle in another lane. The height of most cameras is roughly known (1.35 m, standard deviation 0.3 m),
-    so that boxes of similar sizes suffice. The line is fitted by iteratively reweighted least squares with
-    Tukey's biweight, which ignores trucks and false boxes (Beaton and Tukey, *Technometrics*, 1974).
+    vehicle in another lane. `height_m` is the camera's height, if known; that of most cameras is roughly
+    known (1.35 m, standard deviation 0.3 m), so that boxes of similar sizes suffice. The line is fitted by
+    iteratively reweighted least squares with Tukey's biweight, which ignores trucks and false boxes (Beaton
+    and Tukey, *Technometrics*, 1974).
 
     >>> height = np.arange(40, 200, 10)
     >>> bottom = 396 + 0.9 * height
@@ -183,11 +187,15 @@ def estimate_horizon(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> H
             f"boxes must contain {_MIN_BOXES} vehicles that are not truncated by the frame, got "
             f"{len(whole)}; use more frames"
         )
-    mean = np.array([0.5 * frame[0], _CAMERA_HEIGHT])
-    information = np.diag([1 / (_PRIOR_STD * frame[0]) ** 2, 1 / _CAMERA_HEIGHT_STD**2])
+    height, height_std = _CAMERA_HEIGHT, _CAMERA_HEIGHT_STD
+    if height_m is not None:
+        height = check_number(height_m, "height_m", above=0, high=100)
+        height_std = _GIVEN_HEIGHT_STD * height
+    mean = np.array([0.5 * frame[0], height])
+    information = np.diag([1 / (_PRIOR_STD * frame[0]) ** 2, 1 / height_std**2])
     size, bottom = (whole[:, 3] - whole[:, 1]) / Camera.vehicle_height_m, whole[:, 3]
     edge_std = _EDGE_STD_PX * max(frame) / 1280
-    found = np.array([np.median(bottom - _CAMERA_HEIGHT * size), _CAMERA_HEIGHT])
+    found = np.array([np.median(bottom - height * size), height])
     for _ in range(30):
         variance = edge_std**2 + np.square(_RELATIVE_STD * found[1] * size)
         residual = (bottom - found[0] - found[1] * size) / np.sqrt(variance)

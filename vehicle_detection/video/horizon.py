@@ -29,11 +29,17 @@ class ImageDetector(Protocol):
 
 
 def estimate_video_horizon(
-    source: Source, detector: ImageDetector, *, start: float | None = None, end: float | None = None
+    source: Source,
+    detector: ImageDetector,
+    *,
+    height_m: float | None = None,
+    start: float | None = None,
+    end: float | None = None,
 ) -> HorizonEstimate | None:
     """Estimate the horizon from the vehicles in two frames per second of the first 30 seconds after `start`.
 
-    In a video of less than 7.5 seconds, frames follow one another faster. None if there are too few vehicles,
+    `height_m` is the height of the camera above the road, if known. In a video of less than 7.5 seconds,
+    frames follow one another faster. None if there are too few vehicles,
     or if the estimate is too uncertain.
     """
     boxes: list[NDArray[np.floating]] = []
@@ -52,7 +58,7 @@ def estimate_video_horizon(
                 if sum(map(len, boxes)) >= _ENOUGH_BOXES:
                     break
     try:
-        found = estimate_horizon(np.concatenate(boxes), info.shape)
+        found = estimate_horizon(np.concatenate(boxes), info.shape, height_m=height_m)
     except InvalidInputError:  # too few boxes
         return None
     return found if found.horizon_std <= _MAX_STD and 0 <= found.horizon <= 1 else None
