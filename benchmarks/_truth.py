@@ -22,7 +22,6 @@ from benchmarks._report import Row, Target, at_least, at_most
 from vehicle_detection import (
     Camera,
     FrameResult,
-    SearchResult,
     TrackTable,
     VehicleDetector,
     evaluate_tracks,
@@ -34,6 +33,7 @@ from vehicle_detection import (
 )
 from vehicle_detection.evaluation import evaluate_distances
 from vehicle_detection.evaluation.distances import ErrorScores
+from vehicle_detection.search import SearchResult
 from vehicle_detection.tables import CORNERS
 from vehicle_detection.tracking import backfill_results, search_delay
 
