@@ -170,11 +170,11 @@ def _view(mean: Floats, measured: Measurements, camera: Camera, dt: float, corre
         # The width of a vehicle that crosses the road, or stands across it, is its length.
         sees_width=visible[:, 0] & visible[:, 2] & (tallness > _MIN_TALLNESS),
         # A vehicle that the frame's side cuts shows the height of its far end.
-        sees_height=visible.all(axis=1),
+        sees_height=np.asarray(visible.all(axis=1)),
         # Behind a nearer vehicle a box ends where its visible part does, and grows as its vehicle emerges:
         # its width is only a lower bound, as in a Kalman filter of censored measurements (Allik et al., *IEEE
         # Transactions on Control Systems Technology*, 2016).
-        is_bound=measured.hidden[:, [0, 2]].any(axis=1),
+        is_bound=np.asarray(measured.hidden[:, [0, 2]].any(axis=1)),
         # An error that n frames share must not average out among them: its variance is multiplied by n.
         box_frames=max(1.0, correlation_time / dt),
         shared_frames=max(1.0, _SHARED_TIME / dt),
