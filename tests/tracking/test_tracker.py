@@ -1086,3 +1086,13 @@ def test_the_distance_of_a_near_vehicle_follows_its_bottom_edge(height_std):
         (track,) = tracker.update(Detections([box], [4.0]), (360, 640), time=frame * 0.08)
     true = 576 * camera.height_m / (bottoms[-1] - 201.6) - camera.overhang_m
     assert abs(track.distance_m - true) < track.distance_std_m < 0.3 * true
+
+
+def test_a_frame_with_thousands_of_detections_is_limited_with_a_warning():
+    random = np.random.default_rng(0)
+    corners = random.uniform(0, 600, (2000, 2))
+    found = Detections(np.concatenate([corners, corners + 40], axis=1), random.uniform(0, 3, 2000))
+    tracker = Tracker(fps=25)
+    with pytest.warns(UserWarning, match="2000 detections"):
+        assert 0 < len(tracker.update(found, (720, 1280))) <= 500
+    tracker.update(found, (720, 1280))  # the warning comes once

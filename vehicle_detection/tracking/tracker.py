@@ -11,6 +11,7 @@ frame.
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -69,6 +70,8 @@ _LOW_SCORE_IOU = 0.5
 _COASTING_IOU = 0.1
 # Difference of the scores of two tracks on one vehicle from which on the lower one shows a part of it.
 _PART_GAP = 2.0
+# Largest number of detections of a frame, for which an update takes a third of a second.
+_MAX_DETECTIONS = 500
 # Seconds without a detection after which `max_distance` stops growing.
 _MAX_GAP = 2.0
 
@@ -113,6 +116,7 @@ class Tracker:
         self.params = params or TrackParams()
         self._smoother = make_smoother(self.params)
         self._given_camera = camera or Camera.dashcam()
+        self._warned = False
         self.reset()
 
     def reset(self) -> None:
@@ -181,7 +185,7 @@ class Tracker:
             return self._tracks
         boxes, scores = _sorted_inside(detections, frame)
         used = scores >= min(self.params.high_threshold, self.params.low_threshold)
-        boxes, scores = boxes[used], scores[used]
+        boxes, scores = self._limit(boxes[used], scores[used])
         unassigned = np.ones(len(boxes), np.bool_)
         if self._live:
             coasting = np.array([track.misses > 0 for track in self._live])
@@ -195,6 +199,17 @@ class Tracker:
         self._update_horizon(frame, dt)
         self._tracks, self._at_start = self._snapshot(frame, self._states), False
         return self._tracks
+
+    def _limit(self, boxes: Floats, scores: Floats) -> tuple[Floats, Floats]:
+        """Keep the best detections of a frame that has too many, and warn of the first such frame."""
+        if len(boxes) > _MAX_DETECTIONS and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"a frame has {len(boxes)} detections; the {_MAX_DETECTIONS} best of a frame are tracked: raise "
+                "the threshold of the detector",
+                stacklevel=3,
+            )
+        return boxes[:_MAX_DETECTIONS], scores[:_MAX_DETECTIONS]
 
     def predict(self, *, time: float | None = None, frames: int = 1) -> tuple[Track, ...]:
         """Estimate where the confirmed tracks will be, without changing the state of the tracker.
