@@ -53,7 +53,7 @@ def _one_box(box: Any, name: str) -> Floats:
     boxes = corner_array([box], name).astype(np.float64)
     if not len(boxes):
         raise InvalidInputError(f"{name} must be a pair of corners ((x1, y1), (x2, y2)); got {describe(box)}")
-    return boxes[0]
+    return np.asarray(boxes[0])
 
 
 def _corners(box: Floats) -> Corners:
