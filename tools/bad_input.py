@@ -408,10 +408,11 @@ _OTHER_NAMES = {
     "by": "column",
     "frames": "frame", "label": "column", "n_frames": "frames", "parameter": "column", "path": "file|folder",
     "quality": "column", "configurations": "configuration|preset", "image": "path|frame",
-    "frame": "img|image", "patches": "image file", "windows": "boxes|bbox_list", "X": "source",
+    "frame": "img|image", "patches": "image file|rows", "windows": "boxes|bbox_list", "X": "source",
     "name": "preset", "detector": "model", "imgs": "image file", "hist_feat": "features",
     "hog_feat": "features", "spatial_feat": "features",
-    "vehicles": "png", "non_vehicles": "png",
+    "vehicles": "png|csv", "non_vehicles": "png|json", "source": "png|csv", "images": "folder",
+    "bbox_list": "boxes", "patches_or_labels": "vehicles", "halving": "n_folds",
 }  # fmt: skip
 """What the error of a bad argument may name instead."""
 
