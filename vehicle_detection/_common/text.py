@@ -93,15 +93,6 @@ def encodable(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
-# Characters that move the cursor, change colors or reverse the order of others.
-_CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
-
-
-def printable(text: str) -> str:
-    r"""Return text that does nothing in a terminal: control characters become ``\x1b`` and the like."""
-    return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], text)
-
-
 def spreadsheet_text(text: str) -> str:
     """Put an apostrophe before a name that a spreadsheet would take for a formula."""
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text

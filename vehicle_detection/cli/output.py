@@ -6,6 +6,7 @@ import contextlib
 import io
 import logging
 import os
+import re
 import sys
 import tempfile
 import textwrap
@@ -42,10 +43,17 @@ def replace_unprintable() -> None:
         sys.stdout.reconfigure(errors="replace")
 
 
+# Characters that move the cursor, change colors or reverse the order of others.
+_CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+
+
+def printable(text: str) -> str:
+    r"""Return text that does nothing in a terminal: control characters become ``\x1b`` and the like."""
+    return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
 def print_line(text: str, *, err: bool = False, indent: int = 2, bold: bool = False) -> None:
     """Print a text; in a terminal, above progress bars, and wrapped at spaces with an indent."""
-    from vehicle_detection._common import printable
-
     stream = sys.stderr if err else sys.stdout
     text = typer.style(printable(text), bold=True) if bold else printable(text)
     if (width := _terminal_width(stream)) is None:
@@ -140,8 +148,6 @@ def print_table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]])
     from rich import box
     from rich.console import Console
     from rich.table import Table
-
-    from vehicle_detection._common import printable
 
     terminal = _terminal_width(sys.stdout)
     rows = [[printable(cell) for cell in row] for row in rows]

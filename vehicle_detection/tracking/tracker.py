@@ -205,8 +205,8 @@ class Tracker:
         if len(boxes) > _MAX_DETECTIONS and not self._warned:
             self._warned = True
             warnings.warn(
-                f"a frame has {len(boxes)} detections; the {_MAX_DETECTIONS} best of a frame are tracked: raise "
-                "the threshold of the detector",
+                f"a frame has {len(boxes)} detections; the {_MAX_DETECTIONS} best of a frame are tracked: "
+                "raise the threshold of the detector",
                 stacklevel=3,
             )
         return boxes[:_MAX_DETECTIONS], scores[:_MAX_DETECTIONS]

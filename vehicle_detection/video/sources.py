@@ -39,6 +39,7 @@ class FrameSource(Closing):
     A context manager, and an iterable of ``(index, time, frame)``: the frame's number from 0, its time in
     seconds, and an upright ``(H, W, 3)`` uint8 RGB array.
 
+    >>> from vehicle_detection import open_source
     >>> with open_source("test_images/*.jpg", fps=10) as source:
     ...     print(source.info.frames, source.live, source.rereadable)
     6 False True
