@@ -323,7 +323,7 @@ def test_a_source_that_changes_while_it_is_read_is_named(tmp_path, change):
         def spoil(result):
             if change == "truncated":
                 os.truncate(path, 3000)
-            else:
+            elif result.index == 0:  # a later copy may get the inode of the first file
                 shutil.copy(path, tmp_path / "copy.mp4")
                 (tmp_path / "copy.mp4").replace(path)
 
