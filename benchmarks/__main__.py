@@ -73,10 +73,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--compare", metavar="REF", help="only compare the speed with another commit's")
     parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FILE", help="the JSON file to write")
     options = parser.parse_args(arguments)
-    sequences = [Path(name) for name in options.names if name not in BENCHMARKS and Path(name).is_dir()]
-    if sequences:
-        options.names = ["truth"]
-    unknown = sorted(set(options.names) - set(BENCHMARKS))
+    folders = {name for name in options.names if name not in BENCHMARKS and Path(name).is_dir()}
+    unknown = sorted(set(options.names) - set(BENCHMARKS) - folders)
     if unknown:
         parser.error(f"no benchmark {unknown[0]!r}; choose from {', '.join(BENCHMARKS)}")
     for name in ("seeds", "jobs"):
@@ -95,13 +93,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
             long=options.long,
             seeds=options.seeds,
             jobs=options.jobs,
-            sequences=sequences,
+            sequences=[Path(name) for name in options.names if name in folders],
             fps=options.fps,
         )
         if options.compare:
             print_table({"compare": _compare.compare(context, options.compare)}, console)
             return
-        for name in options.names or [name for name in BENCHMARKS if name not in ON_REQUEST]:
+        names = [name for name in options.names if name not in folders]
+        if folders and "truth" not in names:
+            names.append("truth")
+        for name in names or [name for name in BENCHMARKS if name not in ON_REQUEST]:
             console.print(f"measuring {name} ...", highlight=False)
             results[name] = BENCHMARKS[name](context)
     print_table(results, console)

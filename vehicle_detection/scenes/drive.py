@@ -283,8 +283,8 @@ def render_drive(
         Largest number of rows by which the pitch of the camera moves the horizon up or down.
     rough
         Whether vehicles are 1.5 to 2.6 m wide, with trucks among them, the camera rolls by up to a degree,
-        and pitches by up to 0.3 without `pitch_jitter_px`, and the vehicles follow crests and dips of a
-        radius of 4 km; the surface of the road is drawn level.
+        and pitches by up to 0.3 degrees without `pitch_jitter_px`, and the vehicles follow crests and dips
+        of a radius of 4 km; the surface of the road is drawn level.
     random_state, **view
         As for `render_scene`.
 
