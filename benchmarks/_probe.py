@@ -98,7 +98,7 @@ def each(kind: str, folder: str, out: str) -> dict[str, Any]:
                     path,
                     target if kind == "videos" else None,
                     detector,
-                    workers=1,
+                    jobs=1,
                     progress=False,
                     on_result=write,
                 )

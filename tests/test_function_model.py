@@ -62,12 +62,12 @@ def test_a_function_detects_tracks_and_draws():
     assert (detector.annotate(frame, results[-1]) != frame).any()
 
 
-@pytest.mark.parametrize("workers", [1, 3])
-def test_a_function_annotates_a_video(tmp_path, workers):
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_a_function_annotates_a_video(tmp_path, jobs):
     clip = write_clip(tmp_path / "clip.mp4", [frame_with(moved(step)) for step in range(15)], fps="25")
     results = []
     report = process_video(
-        clip, tmp_path / "out.mp4", detector_from(find_red), workers=workers, on_result=results.append
+        clip, tmp_path / "out.mp4", detector_from(find_red), jobs=jobs, on_result=results.append
     )
     assert (report.frames, report.tracks) == (15, 1)
     assert [track.id for track in results[-1].shown] == [1]
@@ -150,7 +150,7 @@ def test_a_failing_function_is_named_with_its_frame(tmp_path):
     clip = write_clip(tmp_path / "clip.mp4", [frame_with()] * 10, fps="25")
     calls.clear()
     with pytest.raises(DetectorError, match=r"^at 0.16 s: the function failing failed"):
-        process_video(clip, tmp_path / "out.mp4", detector, workers=1)
+        process_video(clip, tmp_path / "out.mp4", detector, jobs=1)
     assert not (tmp_path / "out.mp4").exists()
 
 

@@ -355,7 +355,7 @@ class _Valid:
             "open_source": {"source": clip},
             "precision_recall_curve": {"labels": truth},
             "probe_video": {"path": clip},
-            "process_video": {"source": clip, "progress": False, "workers": 1},
+            "process_video": {"source": clip, "progress": False, "jobs": 1},
             "read_camera": {"path": folder / "camera.json"},
             "read_frames": {"source": clip},
             "read_image": {"path": folder / "valid.png"},

@@ -51,7 +51,7 @@ def test_outputs_are_partitioned_and_equal_process_video(card, model, tmp_path):
     expected = tmp_path / "expected.csv"
     single = card / "20260131_093000_F.mp4"
     with VehicleDetector(model, jobs=1) as detector, open_tracks(expected) as write:
-        process_video(single, tmp_path / "expected.mp4", detector, workers=1, on_result=write)
+        process_video(single, tmp_path / "expected.mp4", detector, jobs=1, on_result=write)
     (record,) = (each for each in found.values() if each["start"] == "2026-01-31T09:30:00")
     assert (out / record["outputs"]["video"]).read_bytes() == (tmp_path / "expected.mp4").read_bytes()
     rows = parquet.read_table(out / record["outputs"]["tracks"], partitioning=None).to_pylist()

@@ -42,10 +42,10 @@ from vehicle_detection.video.engine import _QueuedFrame
 
 def test_the_result_does_not_depend_on_the_number_of_workers(clip, tmp_path):
     outcomes = []
-    for workers in (1, 2, 5):
-        target, results = tmp_path / f"{workers}.mp4", []
+    for jobs in (1, 2, 5):
+        target, results = tmp_path / f"{jobs}.mp4", []
         detector = StubDetector(pause=0.01)
-        process_video(clip, target, detector, workers=workers, on_result=results.append)
+        process_video(clip, target, detector, jobs=jobs, on_result=results.append)
         outcomes.append((target.read_bytes(), results))
     assert outcomes[0] == outcomes[1] == outcomes[2]
 
@@ -66,7 +66,7 @@ def test_memory_does_not_grow_with_the_length_of_the_video(tmp_path):
             weakref.finalize(frame, freed)
             return super().search(frame)
 
-    process_video(source, tmp_path / "out.mp4", CountingDetector(), workers=2)
+    process_video(source, tmp_path / "out.mp4", CountingDetector(), jobs=2)
     assert max_alive <= 6
     assert alive == 0
 
@@ -76,8 +76,8 @@ class ExpectedError(Exception):
 
 
 @pytest.mark.parametrize("method", ["search", "track", "draw", "on_result"])
-@pytest.mark.parametrize(("call", "workers"), [(0, 3), (7, 1), (19, 2)])
-def test_an_error_is_raised_unchanged_and_leaves_no_file(clip, tmp_path, method, call, workers):
+@pytest.mark.parametrize(("call", "jobs"), [(0, 3), (7, 1), (19, 2)])
+def test_an_error_is_raised_unchanged_and_leaves_no_file(clip, tmp_path, method, call, jobs):
     target = tmp_path / "out.mp4"
     target.write_bytes(b"an existing file")
     error, calls = ExpectedError("unchanged"), []
@@ -94,7 +94,7 @@ def test_an_error_is_raised_unchanged_and_leaves_no_file(clip, tmp_path, method,
     if method != "on_result":
         setattr(stub, method, fail)
     with pytest.raises(ExpectedError, match="unchanged") as caught:
-        process_video(clip, target, stub, workers=workers, on_result=fail if method == "on_result" else None)
+        process_video(clip, target, stub, jobs=jobs, on_result=fail if method == "on_result" else None)
     assert caught.value is error
     assert os.listdir(tmp_path) == ["out.mp4"]
     assert target.read_bytes() == b"an existing file"
@@ -234,12 +234,12 @@ class IntervalStub(StubDetector):
         return FrameResult(result.index, time, Detections.empty(), Detections.empty(), ())
 
 
-@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("jobs", [1, 3])
 @pytest.mark.parametrize("interval", [1, 2, 3, 50])
-def test_frames_between_the_searched_ones_are_interpolated(clip, tmp_path, interval, workers):
+def test_frames_between_the_searched_ones_are_interpolated(clip, tmp_path, interval, jobs):
     target, results = tmp_path / "out.mp4", []
     detector = IntervalStub()
-    report = process_video(clip, target, detector, every=interval, workers=workers, on_result=results.append)
+    report = process_video(clip, target, detector, every=interval, jobs=jobs, on_result=results.append)
     frames = report.frames
     assert sorted(detector.searched) == list(range(0, frames, interval))
     assert detector.steps == [(1, False)] + [(interval, False)] * (len(detector.searched) - 1)
@@ -272,7 +272,7 @@ def test_the_first_frame_of_a_scene_is_searched(tmp_path):
     detector.search = lambda frame: detector.searched.append(int(frame.mean())) or float(frame.mean())
     results = []
     source = write_clip(tmp_path / "cuts.mp4", frames)
-    process_video(source, None, detector, workers=1, every=3, on_result=results.append)
+    process_video(source, None, detector, jobs=1, every=3, on_result=results.append)
     # Frames 0 and 3; the cuts at 4 and 7; and 10.
     assert [round(level, -1) for level in detector.searched] == [20, 20, 200, 20, 20]
     assert [cut for _, cut in detector.steps] == [False, False, True, True, False]

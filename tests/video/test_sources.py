@@ -67,7 +67,7 @@ def test_segments_become_one_video(card, tmp_path):
     index, times, seen = numbers(files)
     assert index == seen == tuple(range(20))
     assert times == pytest.approx(np.arange(20) / 8)
-    report = process_video(files, tmp_path / "trip.mp4", StubDetector(), workers=2)
+    report = process_video(files, tmp_path / "trip.mp4", StubDetector(), jobs=2)
     assert frame_numbers(tmp_path / "trip.mp4") == list(range(20))
     assert report.frames == 20
     # One vehicle for six frames each, as in a single file: the state is kept at the cuts.
@@ -425,7 +425,7 @@ def test_a_live_source_drops_frames_rather_than_lag(tmp_path, monkeypatch):
     results = []
     with endless_pipe(tmp_path / "pipe"), open_source(tmp_path / "pipe", live=True) as source:
         report = process_video(
-            source, tmp_path / "out.mp4", Slow(), workers=1, end=1.5, on_result=results.append
+            source, tmp_path / "out.mp4", Slow(), jobs=1, end=1.5, on_result=results.append
         )
         with pytest.raises(InvalidInputError, match="can be read only once"):
             source.read()

@@ -46,7 +46,7 @@ def test_closing_the_window_ends_the_run_and_completes_the_video(folder, tmp_pat
     clip = write_clip(folder / f"long.{suffix}", gray_frames(20) * 8, sound=True)
     window, target = Recorder(last=3), tmp_path / f"out.{suffix}"
     monkeypatch.setattr(writing, "open_viewer", lambda title: window)
-    report = process_video(clip, target, StubDetector(pause=0.01), show=True, workers=1)
+    report = process_video(clip, target, StubDetector(pause=0.01), show=True, jobs=1)
     assert 3 <= report.frames < 160
     assert frame_numbers(target) == [number % 20 for number in range(report.frames)]
     assert sound_seconds(target) == pytest.approx(float(report.frames / report.fps), abs=0.07)

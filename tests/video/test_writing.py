@@ -141,7 +141,7 @@ def test_a_report_without_frames():
         ({"start": 60}, r"start must be less than the video's length of 0\.\d+ s; got 60 s"),
         ({"start": 0.001, "end": 0.002}, "end must be at least one frame later than the start, at 29.97"),
         ({"preset": "warp"}, "preset must be one of 'ultrafast'"),
-        ({"workers": 0}, "workers must be an integer at least 1"),
+        ({"jobs": 0}, "jobs must be an integer at least 1"),
         ({"on_result": 3}, "on_result must be a function"),
         ({"detector": object()}, "detector must have the methods .* without search; pass a VehicleDetector"),
         ({"source": "missing.mp4"}, "source missing.mp4 does not exist"),

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from vehicle_detection.video import FrameSource, VideoReport
 
 
-@option_names(target="--output", workers="--jobs", height_m="--camera-height")
+@option_names(target="--output", height_m="--camera-height")
 @takes(VideoOptions)
 def video(options: VideoOptions) -> None:
     """Track the vehicles of a video, and write or show an annotated copy.
@@ -44,7 +44,7 @@ def video(options: VideoOptions) -> None:
     _check(options)
     outputs = SideOutputs(options)
     files = options.files().values()
-    tracking: dict[str, Any] = {"workers": options.jobs, "every": options.every, **options.span()}
+    tracking: dict[str, Any] = {"jobs": options.jobs, "every": options.every, **options.span()}
     with (
         name_kept_files(files),
         output_folder(options.clips, "--clips"),
@@ -85,7 +85,7 @@ def _check_run(options: VideoOptions, source: FrameSource, detector: vd.VehicleD
     """Refuse what `process_video` would refuse, before anything is computed or replaced."""
     from vehicle_detection.video import check_video_target
 
-    vd.track(source, detector, workers=options.jobs, every=options.every, **options.span()).close()
+    vd.track(source, detector, jobs=options.jobs, every=options.every, **options.span()).close()
     if options.output is not None:
         check_video_target(options.output, source.files, preset=options.preset)
 

@@ -188,7 +188,7 @@ def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
         try:
             with _open(task, folder) as source, _open_tracks(folder / "tracks.parquet", key) as write:
                 options = {name: settings[name] for name in ("audio", "preset")}
-                options |= {"every": settings["options"].get("every"), "workers": 1, "progress": False}
+                options |= {"every": settings["options"].get("every"), "jobs": 1, "progress": False}
                 report = process_video(source, video, detector, on_result=write, **options)
         except VideoError as error:
             message = str(error).replace(str(folder / "video.mp4"), f"the video in {folder.parent}")

@@ -1,6 +1,6 @@
 """`track`: the one engine that processes a source: decode, search in parallel, track in order.
 
-The results do not depend on the number of workers. In memory are the frames decoded ahead (`lookahead`),
+The results do not depend on the number of `jobs`. In memory are the frames decoded ahead (`lookahead`),
 those between two searched frames, and those held back for backfilling (`delay`).
 """
 
@@ -160,7 +160,7 @@ class _Plan:
     detector: Any
     first: int
     count: int | None
-    workers: int
+    jobs: int
     interval: int
     delay: int
     lookahead: int
@@ -180,7 +180,7 @@ class _Pipeline:
         self.dropped = 0  # frames that a live source dropped
         self.damage = ""  # what is damaged in the source; known after the last frame
         self._queue: ClosableQueue[_QueuedFrame] = ClosableQueue(plan.lookahead)
-        self._pool = ThreadPoolExecutor(plan.workers, thread_name_prefix="vehicle-search")
+        self._pool = ThreadPoolExecutor(plan.jobs, thread_name_prefix="vehicle-search")
         self._reader: Reader | None = None
         self._lock = threading.Lock()
         self._aborted = self.stopped = False
@@ -410,7 +410,7 @@ def track(
     start: float | None = None,
     end: float | None = None,
     every: int | None = None,
-    workers: int | None = None,
+    jobs: int | None = None,
     frames: bool = False,
     progress: bool = False,
 ) -> TrackRun:
@@ -428,7 +428,7 @@ def track(
     every
         Search every n-th frame; the tracks of the frames between are interpolated. None: at least 12 frames
         per second, but every frame where the detector or what is drawn needs it.
-    workers
+    jobs
         Number of frames searched in parallel; None: one per core, at most four. The results do not depend on
         it.
     frames
@@ -451,7 +451,7 @@ def track(
     """
     check_flags(frames=frames, progress=progress)
     start, end = check_span(start, end)
-    n_workers = min(available_cores(), 4) if workers is None else check_integer(workers, "workers", low=1)
+    jobs = min(available_cores(), 4) if jobs is None else check_integer(jobs, "jobs", low=1)
     if every is not None:
         every = check_integer(every, "every", low=1, high=1000)
     with contextlib.ExitStack() as stack:
@@ -462,16 +462,16 @@ def track(
         fps = float(info.fps)
         interval = every or (1 if getattr(found, "searches_every_frame", True) else search_interval(fps))
         params = getattr(found, "track_params", None)
-        ahead = min(n_workers * interval, _LOOKAHEAD_BYTES // math.prod(info.shape))
+        ahead = min(jobs * interval, _LOOKAHEAD_BYTES // math.prod(info.shape))
         plan = _Plan(
             source=opened,
             detector=found,
             first=first,
             count=count,
-            workers=n_workers,
+            jobs=jobs,
             interval=interval,
             delay=0 if opened.live or params is None else search_delay(params, fps, interval),
-            lookahead=max(n_workers, ahead) + 1,
+            lookahead=max(jobs, ahead) + 1,
             frames=frames,
         )
         return TrackRun(plan, end=end, progress=progress, on_close=stack.pop_all())

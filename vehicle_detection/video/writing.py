@@ -264,7 +264,7 @@ class TrackOptions(TypedDict, total=False):
     start: float | None
     end: float | None
     every: int | None
-    workers: int | None
+    jobs: int | None
 
 
 def process_video(
@@ -281,7 +281,7 @@ def process_video(
 ) -> VideoReport:
     """Detect and track the vehicles of a video, and write a copy with their boxes: `track` and `write_video`.
 
-    `source`, `detector`, `progress`, ``start``, ``end``, ``every`` and ``workers`` are those of `track`, the
+    `source`, `detector`, `progress`, ``start``, ``end``, ``every`` and ``jobs`` are those of `track`, the
     others those of `write_video`. The detector's ``annotator`` draws; without a target and `show`, nothing
     is drawn.
 
