@@ -158,22 +158,6 @@ class TestSmoothing:
         overlaps = [overlap for time, overlap, _ in matched(steps, "car") if time > 0.5]
         assert np.mean(overlaps) > 0.75
 
-    @pytest.mark.parametrize("smoother", ["history", "nearest"])
-    def test_the_simple_smoothers_track_a_slow_vehicle(self, smoother):
-        params = TrackParams(smoother=smoother)
-        steps = play({"car": lambda t: on_road(20 + t, x=2.0)}, 6, params=params)
-        assert ids(steps, "car") == {1}
-        assert np.mean([overlap for time, overlap, _ in matched(steps, "car") if time > 0.5]) > 0.85
-
-    def test_the_kalman_smoother_tracks_a_fast_vehicle_better(self):
-        scene = {"car": lambda t: np.array([100.0, 400, 200, 490]) + np.array([220.0, 0, 220.0, 0]) * t}
-        best = {}
-        for smoother in ("kalman", "history", "nearest"):
-            steps = play(scene, 4, params=TrackParams(smoother=smoother))
-            best[smoother] = np.mean([overlap for time, overlap, _ in matched(steps, "car") if time > 1])
-        assert best["kalman"] > best["nearest"] + 0.05
-        assert best["kalman"] > best["history"] + 0.05
-
 
 class TestLifeCycle:
     @pytest.mark.parametrize("frames", [1, 2, 3])
@@ -752,9 +736,8 @@ class TestPrediction:
         assert track.distance_std_m > last.distance_std_m
         assert tracker.predict(time=74 / 25 + 0.6)[0].distance_m is None  # as after coasting long
 
-    @pytest.mark.parametrize("smoother", ["kalman", "history", "nearest"])
-    def test_prediction_changes_nothing(self, smoother):
-        one, other = (Tracker(TrackParams(smoother=smoother)) for _ in range(2))
+    def test_prediction_changes_nothing(self):
+        one, other = Tracker(), Tracker()
         rng = np.random.default_rng(3)
         for index in range(60):
             boxes = [np.array(CAR) + 2 * index, np.array([300.0, 410, 380, 480]) - index]
@@ -968,9 +951,9 @@ frame_strategy = st.tuples(
 
 
 @settings(max_examples=60)
-@given(st.lists(frame_strategy, min_size=1, max_size=25), st.sampled_from(["kalman", "history", "nearest"]))
-def test_arbitrary_detections_give_valid_tracks(frames, smoother):
-    params = TrackParams(smoother=smoother, confirm_hits=1, confirm_seconds=0.0, confirm_score=-1.0)
+@given(st.lists(frame_strategy, min_size=1, max_size=25))
+def test_arbitrary_detections_give_valid_tracks(frames):
+    params = TrackParams(confirm_hits=1, confirm_seconds=0.0, confirm_score=-1.0)
     tracker, time, known = Tracker(params), 0.0, 0
     for rows, step, repeats in frames:
         detections = Detections([box for box, _ in rows], [score for _, score in rows])

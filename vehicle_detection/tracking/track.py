@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Checked, Floats, choice, describe, integer, number, pluralize
+from vehicle_detection._common import Checked, Floats, describe, integer, number, pluralize
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 
@@ -26,10 +26,6 @@ class TrackParams(Checked):
 
     Attributes
     ----------
-    smoother
-        ``"kalman"``: a constant-velocity Kalman filter; ``"history"``: weighted mean of the last boxes (the
-        course's second system); ``"nearest"``: the box moves a fraction of the way to the nearest detection
-        (the course's first system).
     score_time_constant
         Time constant of the exponential moving average of a track's scores.
     high_threshold, low_threshold
@@ -69,9 +65,6 @@ class TrackParams(Checked):
     process_noise_position, process_noise_size
         Process noise of the center and of the size: standard deviation by which their speeds change in a
         second, in sizes per second.
-    history_seconds, nearest_weight
-        Length of the mean of the smoother ``"history"``, and fraction of the way that the smoother
-        ``"nearest"`` moves in 0.04 seconds, in (0, 1].
 
     Examples
     --------
@@ -79,7 +72,6 @@ class TrackParams(Checked):
     0.3
     """
 
-    smoother: Literal["kalman", "history", "nearest"] = choice("kalman", ("kalman", "history", "nearest"))
     score_time_constant: float = number(0.3, above=0, high=3600)
     high_threshold: float = number(-0.3, low=-1e6, high=1e6)
     low_threshold: float = number(-1.5, low=-1e6, high=1e6)
@@ -101,8 +93,6 @@ class TrackParams(Checked):
     measurement_correlation_time: float = number(0.04, low=0, high=3600)
     process_noise_position: float = number(0.18, above=0, high=100)
     process_noise_size: float = number(0.1, above=0, high=100)
-    history_seconds: float = number(0.4, above=0, high=3600)
-    nearest_weight: float = number(0.3, above=0, high=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -241,7 +231,6 @@ class TrackState:
     hidden: bool = False  # whether another vehicle explains the missing detection
     covered: float = 0.0  # fraction of its box that nearer vehicles cover
     lost: bool = False  # whether its predicted position is only a guess
-    past_boxes: list[tuple[float, Floats]] = field(default_factory=list)  # for the smoother "history"
 
     def __post_init__(self) -> None:
         self.mean_score = self.score / self.weight

@@ -33,6 +33,7 @@ from vehicle_detection.tracking.association import (
     distinct_vehicles,
     hidden_edges,
     match_approaching,
+    match_boxes,
     merged_detections,
     nearer_cover,
 )
@@ -45,11 +46,11 @@ from vehicle_detection.tracking.distance import (
 from vehicle_detection.tracking.horizon import HorizonFilter
 from vehicle_detection.tracking.kalman import (
     OUTWARD,
+    KalmanSmoother,
     KalmanStates,
     Measurements,
     coasted_distance,
     exit_times,
-    make_smoother,
 )
 from vehicle_detection.tracking.track import TIME_TOLERANCE, Track, TrackParams, TrackState, weight_of
 
@@ -114,7 +115,7 @@ class Tracker:
         self._calibration = calibration
         self._frame_seconds = 1 / check_number(fps, "fps", above=0, high=1e6)
         self.params = params or TrackParams()
-        self._smoother = make_smoother(self.params)
+        self._smoother = KalmanSmoother(self.params)
         self._given_camera = camera or Camera.dashcam()
         self._warned = False
         self.reset()
@@ -217,8 +218,7 @@ class Tracker:
         `time` is in seconds, not before the last frame; by default `frames` frames after it. Returns the
         tracks by id, as `update` would if nothing was detected: the state is ``"coasting"``, and ages and
         misses have grown; score and ``shown`` are those of the last frame. A track that has left the frame by
-        then is left out. The smoothers ``"history"`` and ``"nearest"`` have no motion model and leave each
-        box where it is.
+        then is left out.
 
         >>> tracker = Tracker(fps=25)
         >>> for frame in range(50):
@@ -296,7 +296,7 @@ class Tracker:
         Returns the detection of each track, the merged detection of each track without one, and the tracks
         whose own detection is merged.
         """
-        params, match = self.params, self._smoother.match
+        params = self.params
         predicted = _clip(self._states.boxes(), frame)
         confirmed = sum(track.id > 0 for track in self._live)
         # The distance grows with the time without a detection, and is smaller for tentative tracks, so that
@@ -308,25 +308,25 @@ class Tracker:
         high = int((scores >= params.high_threshold).sum())
         lost = [track.misses > 0 and not track.hidden for track in self._live]
         rows = [row for row in range(confirmed) if not lost[row]]
-        pairs = match(predicted[rows], boxes[:high], max_distance[rows])
+        pairs = match_boxes(predicted[rows], boxes[:high], max_distance[rows])
         own = {rows[row]: column for row, column in pairs}
         # 2. Lost tracks, which must overlap them, and tentative ones with the other ones.
         rows = [row for row in range(len(self._live)) if lost[row] or row >= confirmed]
         columns = sorted({*range(high)} - {*own.values()})
         min_iou = np.array([_COASTING_IOU if row < confirmed else 0.0 for row in rows])[:, None]
-        for row, column in match(predicted[rows], boxes[columns], max_distance[rows], min_iou):
+        for row, column in match_boxes(predicted[rows], boxes[columns], max_distance[rows], min_iou):
             own[rows[row]] = columns[column]
         of_confirmed = {row: column for row, column in own.items() if row < confirmed}
         merged, shared = merged_detections(predicted[:confirmed], boxes[:high], of_confirmed)
         # 3. Remaining confirmed tracks with low-score detections.
         rows = [row for row in range(confirmed) if row not in own and row not in shared]
         near = _LOW_SCORE_DISTANCE * max_distance[rows]
-        for row, column in match(predicted[rows], boxes[high:], near, _LOW_SCORE_IOU):
+        for row, column in match_boxes(predicted[rows], boxes[high:], near, _LOW_SCORE_IOU):
             own[rows[row]] = high + column
         # 4. Remaining tentative tracks with low-score detections.
         columns = sorted({*range(high, len(boxes))} - {*own.values()})
         rows = [row for row in range(confirmed, len(self._live)) if row not in own]
-        for row, column in match(predicted[rows], boxes[columns], max_distance[rows]):
+        for row, column in match_boxes(predicted[rows], boxes[columns], max_distance[rows]):
             own[rows[row]] = columns[column]
         # 5. Tentative tracks, whose speed is not known, with sure detections of approaching vehicles. Unsure
         # ones may be of what stands beside the road, which comes nearer, too.
