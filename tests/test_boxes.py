@@ -180,8 +180,9 @@ def test_detections_reject_invalid_columns(boxes, scores, message):
 class StandIn:
     """What the library uses of supervision.Detections."""
 
-    def __init__(self, xyxy, confidence=None, class_id=None, tracker_id=None):
+    def __init__(self, xyxy, confidence=None, class_id=None, tracker_id=None, data=None):
         self.xyxy, self.confidence, self.class_id, self.tracker_id = xyxy, confidence, class_id, tracker_id
+        self.data = data or {}
 
 
 TWO = [[0, 0, 10, 10], [5, 5, 9, 9]]
@@ -250,9 +251,40 @@ def test_detections_become_those_of_supervision(monkeypatch):
     assert converted.tracker_id.tolist() == [4, 7]
     assert found.to_supervision().tracker_id is None
     assert converted.xyxy.dtype == converted.confidence.dtype == np.float32
-    back = Detections.from_supervision(converted)
-    np.testing.assert_allclose(back.scores, found.scores, atol=1e-5)
+    assert converted.data["class_name"].tolist() == ["vehicle", "vehicle"]
     assert Detections.empty().to_supervision().xyxy.shape == (0, 4)
+
+
+def test_the_way_to_supervision_and_back_changes_no_meaning(monkeypatch):
+    monkeypatch.setitem(sys.modules, "supervision", SimpleNamespace(Detections=StandIn))
+    found = Detections(TWO, [0.5, 2.5], [0.25, 0.875], ["bus", "car"], [5, 2])
+    back = Detections.from_supervision(found.to_supervision())
+    for name in ("boxes", "scores", "confidences", "labels", "class_ids"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(found, name))
+
+
+def test_results_of_ultralytics_have_names():
+    boxes = SimpleNamespace(xyxy=TWO, conf=[0.5, 0.9], cls=[2.0, 7.0])
+    found = Detections.from_supervision(SimpleNamespace(boxes=boxes, names={2: "car", 7: "truck"}))
+    assert found.labels.tolist() == ["car", "truck"]
+    assert found.class_ids.tolist() == [2, 7]
+    assert found.confidences.tolist() == [0.5, 0.9]
+
+
+@pytest.mark.parametrize("name", ["labels", "class_ids"])
+@pytest.mark.parametrize("value", [["car"], [1], "car", [1.5, None]])
+def test_each_box_has_a_class(name, value):
+    with pytest.raises(InvalidInputError, match=f"{name} must be"):
+        Detections(TWO, [1, 2], **{name: value})
+
+
+def test_classes_follow_their_boxes():
+    found = Detections(TWO, [1, 2], labels=["car", "bus"], class_ids=[2, 5])
+    assert found[[1]].labels.tolist() == ["bus"]
+    assert (found + found[:1]).class_ids.tolist() == [2, 5, 2]
+    assert (found + Detections(TWO, [1, 2])).labels is None
+    assert "1 bus, 1 car" in repr(found)
+    assert found.to_pandas()["label"].tolist() == ["car", "bus"]
 
 
 def test_the_remedy_without_supervision(monkeypatch):

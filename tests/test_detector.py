@@ -324,7 +324,6 @@ GOOD = frame_with(CAR)
         (GOOD.astype(np.uint16) * 257, "scale 16-bit values"),
         (GOOD[:0], "the image is empty"),
         (None, "read files with vehicle_detection.read_image"),
-        (b"\xff\xd8\xff", r"decode it with vehicle_detection.read_image\(data\)"),
     ],
 )
 def test_bad_frames_are_refused_and_change_nothing(frame, message):

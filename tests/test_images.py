@@ -215,7 +215,7 @@ def test_a_failed_write_keeps_the_earlier_file(tmp_path, picture, monkeypatch):
     [
         (lambda _: read_image("nothing.png"), r"image file nothing.png does not exist; check the path"),
         (lambda _: read_image("."), r"image file \. is a folder; choose a file in it"),
-        (lambda _: read_image("https://host/a.jpg"), r"https://host/a.jpg is a URL; download it first"),
+        (lambda _: read_image("ftp://host/a.jpg"), r"URL ftp://host/a.jpg must begin with http"),
         (lambda image: write_image("nowhere/a.png", image), "path needs an existing folder"),
         (lambda image: write_image("a.png", image[..., 0]), "image must be an"),
         (lambda image: write_image("folder.png", image), "path must be a file, got the folder"),

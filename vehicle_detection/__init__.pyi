@@ -4,7 +4,7 @@ from .boxes import Detections, clip_boxes, iou_matrix, non_max_suppression
 from .camera import Camera, open_camera, read_camera, write_camera
 from .course import HeatmapDetector
 from .datasets import FrameSet, PatchSet, fetch_patches, load_frames, load_patches, load_training_patches
-from .detector import Detector, VehicleDetector, load_model
+from .detector import Detector, VehicleDetector, detect, load_model
 from .drawing import blur_boxes, draw_boxes, draw_detections, draw_labeled_bboxes
 from .drive import (
     ReportWriter,
@@ -44,6 +44,7 @@ from .images import read_image, write_image
 from .network import NetworkModel, NetworkParams
 from .notebook import Explorer
 from .regions import RegionParams, find_vehicles
+from .results import ImageDetections
 from .scenes import render_drive, render_patches, render_scene
 from .search import SearchBand, SearchParams
 from .svm import VehicleClassifier, load_classifier
@@ -79,6 +80,7 @@ __all__ = [
     "HeatHistory",
     "HeatParams",
     "HeatmapDetector",
+    "ImageDetections",
     "InvalidInputError",
     "LabelledFrames",
     "ModelFileError",
@@ -113,6 +115,7 @@ __all__ = [
     "count_vehicles",
     "course",
     "datasets",
+    "detect",
     "detector_from",
     "draw_boxes",
     "draw_detections",

@@ -7,9 +7,10 @@ without ``check_`` in their body are for arrays that were checked.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,30 +53,42 @@ class Detections:
     Attributes
     ----------
     boxes, scores
-        ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, and ``(N,)`` finite float64 scores.
+        ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, and ``(N,)`` finite float64 scores, by which boxes are ranked.
+        Those of vehicles are log-odds above the model's threshold: 0 is the threshold, whatever its
+        confidence. Windows of a classifier have the values of its decision function, and boxes of a heat map
+        the heat.
     confidences
         ``(N,)`` calibrated probabilities of a vehicle in [0, 1]; None if they are unknown. A column of NaN,
         as in a table, becomes None.
+    labels, class_ids
+        ``(N,)`` names of the classes, such as ``"car"``, and their numbers in the model; None if unknown.
 
     Examples
     --------
-    >>> found = Detections([[0, 0, 10, 10], [5, 5, 9, 9]], [0.5, 2.0])
+    >>> found = Detections([[0, 0, 10, 10], [5, 5, 9, 9]], [0.5, 2.0], [0.62, 0.88], ["car", "bus"])
     >>> found
-    Detections(2 boxes, scores 0.50 to 2.00)
-    >>> found[found.scores > 1].boxes
+    Detections(2 boxes, confidences 0.62 to 0.88, 1 bus, 1 car)
+    >>> found[found.labels == "bus"].boxes
     array([[5, 5, 9, 9]])
     >>> found + found[:1]
-    Detections(3 boxes, scores 0.50 to 2.00)
+    Detections(3 boxes, confidences 0.62 to 0.88, 1 bus, 2 car)
     """
 
     boxes: NDArray[Any]
     scores: Floats
     confidences: Floats | None = None
+    labels: NDArray[np.str_] | None = None
+    class_ids: NDArray[np.int64] | None = None
 
     if TYPE_CHECKING:  # The constructor converts its arguments.
 
         def __init__(
-            self, boxes: Detections | ArrayLike, scores: ArrayLike, confidences: ArrayLike | None = None
+            self,
+            boxes: Detections | ArrayLike,
+            scores: ArrayLike,
+            confidences: ArrayLike | None = None,
+            labels: ArrayLike | None = None,
+            class_ids: ArrayLike | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -91,15 +104,29 @@ class Detections:
                 "where they are unknown"
             )
         vars(self).update(boxes=boxes, scores=scores, confidences=confidences)
+        if self.labels is not None:
+            labels = np.asarray(self.labels).tolist()
+            if len(labels) != len(boxes) or not all(isinstance(label, str) for label in labels):
+                raise InvalidInputError(
+                    f"labels must be a name for each of the {len(boxes)} boxes, got {describe(self.labels)}"
+                )
+            vars(self)["labels"] = np.array(labels, np.str_)
+        if self.class_ids is not None:
+            numbers = _score_column(self.class_ids, "class_ids", len(boxes))
+            vars(self)["class_ids"] = numbers.astype(np.int64)
 
     @classmethod
-    def from_columns(
-        cls, boxes: NDArray[Any], scores: Floats, confidences: Floats | None = None
-    ) -> Detections:
+    def from_columns(cls, boxes: NDArray[Any], scores: Floats) -> Self:
         """Make detections of columns that the library has computed, without checking them."""
         detections = object.__new__(cls)
-        vars(detections).update(boxes=boxes, scores=scores, confidences=confidences)
+        vars(detections).update(boxes=boxes, scores=scores)
         return detections
+
+    def with_columns(self, **columns: Any) -> Self:
+        """Return the same detections with other columns, which are not checked."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self), **columns)
+        return other
 
     @classmethod
     def empty(cls) -> Detections:
@@ -115,18 +142,21 @@ class Detections:
         threshold: float | None = None,
         class_ids: Collection[int] | None = None,
     ) -> Detections:
-        """Convert the detections of another library, such as ``supervision.Detections``.
+        """Convert the detections of another library: ``supervision.Detections``, or results of Ultralytics.
 
         They have ``xyxy``, ``(N, 4)``, ``confidence`` or ``conf``, ``(N,)`` or None if unknown (the score is
-        then 3), and, if known, ``class_id`` or ``cls``, ``(N,)``; the second names are those of the ``boxes``
-        of Ultralytics' results. `score` and `threshold` are as in `detector_from`. `class_ids` keeps only
-        boxes of these classes, such as ``(2, 5, 7)`` for the cars, buses and trucks of COCO.
+        then 3), and, if known, ``class_id`` or ``cls``, ``(N,)``; the second names are those of Ultralytics.
+        Names of classes are those in ``data["class_name"]`` or ``names``. `score` and `threshold` are as in
+        `detector_from`. `class_ids` keeps only boxes of these classes, such as ``(2, 5, 7)`` for the cars,
+        buses and trucks of COCO. What `to_supervision` returns becomes the same detections again.
 
         >>> from types import SimpleNamespace
         >>> found = SimpleNamespace(xyxy=[[0, 0, 9, 9], [5, 5, 9, 9]], confidence=[0.5, 0.9], class_id=[2, 0])
-        >>> Detections.from_supervision(found), Detections.from_supervision(found, class_ids=[0])
-        (Detections(2 boxes, scores 0.00 to 2.20), Detections(1 box, scores 2.20 to 2.20))
+        >>> Detections.from_supervision(found), Detections.from_supervision(found, class_ids=[0]).scores
+        (Detections(2 boxes, confidences 0.50 to 0.90), array([2.19722458]))
         """
+        names = getattr(detections, "names", None)
+        detections = detections.boxes if hasattr(getattr(detections, "boxes", None), "xyxy") else detections
         has_confidence = hasattr(detections, "confidence") or hasattr(detections, "conf")
         if not hasattr(detections, "xyxy") or not has_confidence:
             raise InvalidInputError(
@@ -135,14 +165,22 @@ class Detections:
             )
         scale = check_score_scale(score, threshold)
         boxes, confidence = check_boxes(detections.xyxy), _first_known(detections, "confidence", "conf")
-        certain = np.full(len(boxes), _CERTAIN_SCORE)
-        found = cls(boxes, certain if confidence is None else log_odds(confidence, scale, threshold))
-        if class_ids is None:
-            return found
-        return select_classes(found, _first_known(detections, "class_id", "cls"), check_class_ids(class_ids))
+        classes, data = _first_known(detections, "class_id", "cls"), getattr(detections, "data", None)
+        extra = data if isinstance(data, dict) else {}
+        scores = np.full(len(boxes), _CERTAIN_SCORE)
+        if confidence is not None:
+            scores = log_odds(confidence, scale, threshold)
+        if "score" in extra and scale == "probability" and threshold is None:
+            scores = extra["score"]  # log-odds above the threshold of the model that found them
+        labels = extra.get("class_name")
+        if labels is None and names is not None and classes is not None:
+            labels = [str(names[int(each)]) for each in check_array(classes, "classes")]
+        known = confidence if scale == "probability" else None
+        found = cls(boxes, scores, known, labels, None if classes is None else check_array(classes, "cls"))
+        return found if class_ids is None else select_classes(found, classes, check_class_ids(class_ids))
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Return a table with a row for each box: corners, score and, if known, confidence.
+        """Return a table with a row for each box: corners, score and, if known, confidence and class.
 
         >>> Detections(np.array([[0.0, 0, 50, 40]]), np.array([1.5])).to_pandas().iloc[0].to_dict()
         {'x1': 0.0, 'y1': 0.0, 'x2': 50.0, 'y2': 40.0, 'score': 1.5}
@@ -150,16 +188,16 @@ class Detections:
         import pandas
 
         columns = {**dict(zip(("x1", "y1", "x2", "y2"), self.boxes.T)), "score": self.scores}
-        if self.confidences is not None:
-            columns["confidence"] = self.confidences
-        return pandas.DataFrame(columns)
+        more = {"confidence": self.confidences, "label": self.labels, "class_id": self.class_ids}
+        return pandas.DataFrame(columns | {name: each for name, each in more.items() if each is not None})
 
     def to_supervision(self, *, tracker_id: ArrayLike | None = None) -> Any:
         """Convert to ``supervision.Detections``, for the drawing, counting and tracking of that library.
 
         The confidence is that of the detection or, if unknown, ``1 / (1 + exp(-score))``: a score of 0, the
-        threshold of a vehicle, becomes 0.5. The class is 0. `tracker_id` are ``(N,)`` numbers of the tracks,
-        if known.
+        threshold of a vehicle, becomes 0.5. The class is 0 if it is unknown; its name, ``"vehicle"`` if
+        unknown, is in ``data["class_name"]``, and the score in ``data["score"]``. `tracker_id` are ``(N,)``
+        numbers of the tracks, if known.
         """
         try:
             from supervision import Detections as SupervisionDetections
@@ -169,47 +207,56 @@ class Detections:
                 "pip install supervision"
             ) from error
         ids = None if tracker_id is None else np.asarray(tracker_id, np.int64).reshape(-1)
-        known = self.confidences
+        known, labels, classes = self.confidences, self.labels, self.class_ids
         confidences = LOG_ODDS.probability(self.scores) if known is None else known
+        names = np.full(len(self), "vehicle") if labels is None else labels
         return SupervisionDetections(
             xyxy=self.boxes.astype(np.float32),
             confidence=confidences.astype(np.float32),
-            class_id=np.zeros(len(self), np.int64),
+            class_id=np.zeros(len(self), np.int64) if classes is None else classes,
             tracker_id=ids,
+            data={"class_name": names, "score": self.scores},
         )
 
     def __add__(self, other: Detections) -> Detections:
-        """Join two sets of boxes, such as the windows of two searches."""
+        """Join two sets of boxes, such as the windows of two searches; what one of them lacks is unknown."""
         if not isinstance(other, Detections):
             return NotImplemented
-        if not len(self) or not len(other):  # without boxes, confidences are not unknown
+        if not len(self) or not len(other):  # without boxes, nothing is unknown
             return self if len(self) else other
-        known = self.confidences is not None and other.confidences is not None
-        names = ("boxes", "scores", "confidences") if known else ("boxes", "scores")
-        return self.from_columns(
-            *(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names)
+        pairs = {name: (getattr(self, name), getattr(other, name)) for name in _COLUMNS}
+        return self.with_columns(
+            **{
+                name: None if first is None or second is None else np.concatenate([first, second])
+                for name, (first, second) in pairs.items()
+            }
         )
 
     def __repr__(self) -> str:
         if not len(self):
             return "Detections(0 boxes)"
-        boxes = pluralize(len(self), "box", "es")
-        return f"Detections({boxes}, scores {self.scores.min():.2f} to {self.scores.max():.2f})"
+        known = self.confidences
+        name, values = ("scores", self.scores) if known is None else ("confidences", known)
+        facts = [pluralize(len(self), "box", "es"), f"{name} {values.min():.2f} to {values.max():.2f}"]
+        kinds = Counter([] if self.labels is None else self.labels.tolist())
+        facts += [f"{count} {label}" for label, count in sorted(kinds.items()) if label != "vehicle"]
+        return f"Detections({', '.join(facts)})"
 
     def __len__(self) -> int:
         return len(self.boxes)
 
-    def __getitem__(self, rows: int | slice | NDArray[Any] | list[int]) -> Detections:
+    def __getitem__(self, rows: int | slice | NDArray[Any] | list[int]) -> Self:
         """Take one row by its index, or several by a slice, a mask or a list of indices."""
         taken = [rows] if isinstance(rows, (int, np.integer)) else rows
-        known = self.confidences
-        return self.from_columns(
-            self.boxes[taken], self.scores[taken], None if known is None else known[taken]
-        )
+        columns = ((name, getattr(self, name)) for name in _COLUMNS)
+        return self.with_columns(**{name: None if each is None else each[taken] for name, each in columns})
 
     def __iter__(self) -> Iterator[tuple[NDArray[Any], float]]:
         """Yield ``(box, score)`` pairs."""
         return zip(self.boxes, self.scores.tolist())
+
+
+_COLUMNS = tuple(Detections.__dataclass_fields__)
 
 
 def _score_column(values: ArrayLike, name: str, count: int | None = None) -> Floats:

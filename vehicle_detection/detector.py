@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
+import functools
 import os
 import threading
 import time as clock
 import warnings
 from collections.abc import Collection
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar, Protocol, Self, cast, overload
 
 import numpy as np
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import (
     Closing,
+    available_cores,
     check_bool,
     check_choice,
     check_image,
@@ -30,9 +33,10 @@ from vehicle_detection.camera import Camera, open_camera
 from vehicle_detection.drawing import blur_boxes, draw_boxes
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.heatmap import HeatHistory, HeatParams, frame_heat, label_heat
-from vehicle_detection.images import read_image
+from vehicle_detection.images import image_array, list_images
 from vehicle_detection.network import Device, NetworkModel, load_network
 from vehicle_detection.regions import RegionParams, find_vehicles
+from vehicle_detection.results import ImageDetections
 from vehicle_detection.search import FrameSearch, SearchResult
 from vehicle_detection.svm import VehicleClassifier, load_classifier
 from vehicle_detection.tracking import FrameResult, SceneCuts, Tracker, TrackParams
@@ -202,12 +206,7 @@ class Detector(Closing):
         self, conf: float, regions: RegionParams | HeatParams | None
     ) -> RegionParams | HeatParams | None:
         """Make the model find boxes with this confidence, or return region parameters that do."""
-        limit = min(max(check_number(conf, "conf", low=0, high=1), _MIN_CONF), _MAX_CONF)
-        if isinstance(regions, HeatParams):
-            raise InvalidInputError(
-                f"conf must be None with a heat map, whose heat is no probability; got {conf:g}; set the "
-                "threshold of HeatParams"
-            )
+        limit = _check_confidence(conf, regions)
         if isinstance(self.model, VehicleClassifier):
             return (regions or RegionParams()).with_peak(self.model.calibration.score(limit))
         model: Any = self.model
@@ -239,37 +238,104 @@ class Detector(Closing):
     def fit(self, found: SearchResult) -> Detections:
         """Return the vehicles of a search with confidences, including scores below 0."""
         check_type(found, "found", SearchResult, "pass what search returns")
+        return self._fit(found, self.region_params)
+
+    def _fit(self, found: SearchResult, regions: RegionParams | HeatParams) -> Detections:
         if self.heat_params is not None:
             return label_heat(frame_heat(found.shape, found.windows, self.heat_params), self.heat_params)
         vehicles = found.vehicles
         if vehicles is None:
             if found.shape not in self._cameras:
                 self._cameras[found.shape] = self.camera.for_shape(found.shape)
-            assert isinstance(self.region_params, RegionParams)
-            camera = self._cameras[found.shape]
-            vehicles = find_vehicles(found.windows, camera, found.shape, self.region_params)
-        confidences = self.model.calibration.probability(vehicles.scores)
-        return Detections.from_columns(vehicles.boxes, vehicles.scores, confidences)
+            assert isinstance(regions, RegionParams)
+            vehicles = find_vehicles(found.windows, self._cameras[found.shape], found.shape, regions)
+        return vehicles.with_columns(confidences=self.model.calibration.probability(vehicles.scores))
 
     @overload
-    def detect(self, image: Image | Path) -> Detections: ...
+    def detect(self, image: Image | bytes, *, conf: float | None = None) -> ImageDetections: ...
     @overload
-    def detect(self, image: list[Any]) -> list[Detections]: ...
-    def detect(self, image: Image | Path | list[Any]) -> Detections | list[Detections]:
-        """Detect the vehicles of an image, or of each of a list of images.
+    def detect(self, image: list[Any], *, conf: float | None = None) -> list[ImageDetections]: ...
+    @overload
+    def detect(self, image: Any, *, conf: float | None = None) -> Any: ...
+    def detect(self, image: Any, *, conf: float | None = None) -> Any:
+        """Detect the vehicles of an image, or of each of several images, which are searched in parallel.
 
-        An image is ``(H, W, 3)`` uint8 RGB, or the path of a file. The boxes, in pixels of the image, have
-        scores and, unless they come from a heat map, confidences.
+        Parameters
+        ----------
+        image
+            An ``(H, W, 3)`` uint8 RGB array, the path or URL of an image file, its content as bytes, or an
+            image of Pillow. A list of these, a folder, or a pattern such as ``"frames/*.jpg"`` gives a list.
+        conf
+            Minimum confidence in this call, instead of that of the detector.
+
+        Returns
+        -------
+        ImageDetections
+            Boxes in pixels of the image, with scores and, unless they come from a heat map, confidences.
         """
-        if isinstance(image, list):
-            return [self.detect(each) for each in image]
-        frame = read_image(image) if isinstance(image, (str, os.PathLike)) else check_image(image)
-        vehicles = self.fit(self.search(frame))
-        return vehicles[vehicles.scores >= 0]
+        limit = None if conf is None else _check_confidence(conf, self.region_params)
+        if limit is not None and not isinstance(self.model, VehicleClassifier):
+            cast(Any, self.model).with_confidence(limit)  # refuses scores on a scale of their own
+        images = list_images(image)
+        if images is None:
+            return self._detect_image(image, limit)
+        with ThreadPoolExecutor(min(available_cores(), 4), thread_name_prefix="vehicle-detect") as pool:
+            return list(pool.map(lambda each: self._detect_image(each, limit), images))
+
+    def _detect_image(self, image: Any, limit: float | None) -> ImageDetections:
+        """Detect the vehicles of one image, with another minimum confidence unless `limit` is None."""
+        regions, lowest = self.region_params, 0.0
+        if limit is not None:  # scores are relative to the threshold
+            lowest = self.model.calibration.score(limit)
+            if isinstance(regions, RegionParams):
+                regions = regions.with_peak(lowest)
+        low_score = min(self.low_score, lowest)
+        frame = image_array(image)
+        vehicles = self._fit(
+            self._search.find(frame, self.search_params, min_vehicle_score=low_score), regions
+        )
+        vehicles = vehicles[vehicles.scores >= lowest]
+        if not isinstance(self.model, VehicleClassifier):
+            vehicles = vehicles.with_columns(scores=vehicles.scores - lowest)
+        found = ImageDetections.from_columns(vehicles.boxes, vehicles.scores)
+        return found.with_columns(**vars(vehicles), source=image)
 
     def close(self) -> None:
         """Stop the search's threads; they start again when it is used."""
         self._search.close()
+
+
+def _check_confidence(conf: object, regions: RegionParams | HeatParams | None) -> float:
+    """Return a minimum confidence within the range that a calibration can tell apart."""
+    limit = min(max(check_number(conf, "conf", low=0, high=1), _MIN_CONF), _MAX_CONF)
+    if isinstance(regions, HeatParams):
+        raise InvalidInputError(
+            f"conf must be None with a heat map, whose heat is no probability; got {conf:g}; set the "
+            "threshold of HeatParams"
+        )
+    return limit
+
+
+@functools.lru_cache(maxsize=4)
+def _shared_detector(model: str) -> Detector:
+    """Return the detector of a model that calls of `detect` share."""
+    return Detector(model)
+
+
+def detect(image: Any, model: Path | Model = "default", *, conf: float | None = None) -> Any:
+    """Detect the vehicles of images in one line, as `Detector.detect`.
+
+    A model is loaded in the first call that names it, and kept for the next ones. Use a `Detector` to set a
+    camera, regions or the number of threads, and `VehicleDetector` or `track` for video.
+
+    >>> found = detect("test_images/road1.jpg", conf=0.5)
+    >>> len(found), found.to_pandas().columns.tolist()
+    (2, ['x1', 'y1', 'x2', 'y2', 'score', 'confidence', 'label', 'class_id'])
+    """
+    if isinstance(model, (str, os.PathLike)):
+        return _shared_detector(os.fspath(model)).detect(image, conf=conf)
+    with Detector(model) as detector:
+        return detector.detect(image, conf=conf)
 
 
 class _OneThread:
@@ -398,12 +464,14 @@ class VehicleDetector(Closing):
         return self.detector.search(frame)
 
     @overload
-    def detect(self, image: Image | Path) -> Detections: ...
+    def detect(self, image: Image | bytes, *, conf: float | None = None) -> ImageDetections: ...
     @overload
-    def detect(self, image: list[Any]) -> list[Detections]: ...
-    def detect(self, image: Image | Path | list[Any]) -> Detections | list[Detections]:
+    def detect(self, image: list[Any], *, conf: float | None = None) -> list[ImageDetections]: ...
+    @overload
+    def detect(self, image: Any, *, conf: float | None = None) -> Any: ...
+    def detect(self, image: Any, *, conf: float | None = None) -> Any:
         """Detect the vehicles of images, as `Detector.detect`; tracks are neither used nor changed."""
-        return self.detector.detect(image)
+        return self.detector.detect(image, conf=conf)
 
     def process(self, frame: Image, time: float | None = None, *, search: bool = True) -> FrameResult:
         """Search the next frame of a video and track its vehicles.
@@ -495,13 +563,14 @@ class VehicleDetector(Closing):
         return self.annotator.draw(frame, result)
 
     def __call__(self, frame: Image | Path) -> Image:
-        """Return the next frame annotated; for the path of an image file, that image with its vehicles.
+        """Return the next frame of a video annotated; for single images use `detect`.
 
-        In moviepy use `annotate_clip`: ``clip.image_transform(detector)`` knows no times, and a second clip
-        continues the tracks of the first one. The first frame, which moviepy reads twice, counts once.
+        The path of an image file gives that image with its vehicles. In moviepy use `annotate_clip`:
+        ``clip.image_transform(detector)`` knows no times, and a second clip continues the tracks of the first
+        one. The first frame, which moviepy reads twice, counts once.
         """
         if isinstance(frame, (str, os.PathLike)):
-            image, blur = read_image(frame), self.annotator.blur
+            image, blur = image_array(frame), self.annotator.blur
             boxes = self.detect(image).boxes
             return draw_boxes(image if blur is None else blur_boxes(image, boxes, region=blur), boxes)
         if self._first is not None and self._index == 0 and np.array_equal(frame, self._first[0]):

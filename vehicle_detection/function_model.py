@@ -145,21 +145,24 @@ class FunctionModel:
                 f"the function {self.name} returned an invalid result for a frame of {width}x{height} "
                 f"pixels: {error}"
             ) from error
-        clipped = Detections(clip_boxes(found.boxes.astype(np.float64), frame.shape), found.scores)
+        clipped = found.with_columns(boxes=clip_boxes(found.boxes.astype(np.float64), frame.shape))
         return clipped[box_areas(clipped.boxes) > 0]
 
     def _convert(self, returned: Any) -> Detections:
         """Return detections of what the function returned; boxes within one pixel are fractions."""
+        labels = None
         if isinstance(returned, Detections):
-            returned = (returned.boxes, returned.scores)
+            labels = returned.labels
+            returned = (returned.boxes, returned.scores, returned.class_ids)
         if hasattr(returned, "xyxy"):
             found = Detections.from_supervision(
                 returned, score=self.score, threshold=self.threshold, class_ids=self.class_ids
             )
         elif isinstance(returned, (tuple, list)) and len(returned) in (2, 3):
-            found = Detections(returned[0], log_odds(returned[1], self.score, self.threshold))
+            classes = returned[2] if len(returned) == 3 else None
+            scores = log_odds(returned[1], self.score, self.threshold)
+            found = Detections(returned[0], scores, labels=labels, class_ids=classes)
             if self.class_ids is not None:
-                classes = returned[2] if len(returned) == 3 else None
                 found = select_classes(found, classes, self.class_ids)
         else:
             raise InvalidInputError(

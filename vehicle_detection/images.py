@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import importlib
 import io
 import os
 import re
 import struct
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,11 +23,18 @@ from vehicle_detection._common import (
     check_image,
     check_path,
     describe,
+    download_bytes,
     hide_credentials,
+    is_hidden,
     is_url,
+    local_path,
+    natural_key,
     read_regular_file,
 )
 from vehicle_detection.errors import InvalidInputError
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif")
+"""Suffixes of the images that a folder is searched for."""
 
 # What a format's files begin with, and the class of Pillow that reads their header.
 _HEADERS = {
@@ -75,6 +85,8 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
             f"{name} must have at most {Limit.PIXELS.current():,} pixels, got {size[0]}x{size[1]}; if the "
             f"image is meant to be so large, set {Limit.PIXELS.variable}"
         )
+    if re.match(rb".{4}ftyp(hei[cxms]|hev[cx]|mif1|msf1)", data, re.DOTALL):
+        return _decode_heif(data, name)
     # OpenCV's decoders of other formats are not used: nothing limits the memory that a file claims.
     with contextlib.suppress(cv2.error, MemoryError):
         image = None if size is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
@@ -83,6 +95,30 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
             f"{name} must be a complete image file (PNG, JPEG, ...); it cannot be decoded"
         )
     return np.asarray(image, np.uint8)
+
+
+def _decode_heif(data: bytes, name: str) -> NDArray[np.uint8]:
+    """Decode a picture of a phone with the package pillow-heif, if it is installed."""
+    try:
+        from pillow_heif import open_heif
+    except ImportError:
+        raise InvalidInputError(
+            f"{name} is HEIC, which needs the package pillow-heif; run pip install pillow-heif, or convert "
+            "it to JPEG"
+        ) from None
+    try:
+        picture = open_heif(data, convert_hdr_to_8bit=True)
+        width, height = picture.size
+        if width * height <= Limit.PIXELS.current():
+            return image_array(picture.to_pillow())
+    except (OSError, ValueError, RuntimeError, MemoryError) as error:
+        raise InvalidInputError(
+            f"{name} must be a complete HEIC file; it cannot be decoded: {error}"
+        ) from None
+    raise InvalidInputError(
+        f"{name} must have at most {Limit.PIXELS.current():,} pixels, got {width}x{height}; if the image is "
+        f"meant to be so large, set {Limit.PIXELS.variable}"
+    )
 
 
 def _is_truncated(data: bytes) -> bool:
@@ -96,10 +132,11 @@ def _is_truncated(data: bytes) -> bool:
 def read_image(path: str | os.PathLike[str] | bytes) -> NDArray[np.uint8]:
     """Read an image file as ``(H, W, 3)`` uint8 RGB, whatever its format.
 
-    `path` is a PNG, JPEG, BMP, TIFF, WebP, GIF, PNM or JPEG 2000 file, or the content of one as ``bytes``.
-    Gray, RGBA and 16-bit files are converted, and the EXIF rotation is applied. A file that cannot be decoded
-    completely is an `InvalidInputError`, and so is one of more than 120 million pixels; the environment
-    variable ``VEHICLE_DETECTION_MAX_PIXELS`` sets another limit.
+    `path` is a PNG, JPEG, BMP, TIFF, WebP, GIF, PNM or JPEG 2000 file, its address on the web, or the content
+    of one as ``bytes``; HEIC needs the package pillow-heif. Gray, RGBA and 16-bit files are converted, and
+    the EXIF rotation is applied. A file that cannot be decoded completely is an `InvalidInputError`, and so
+    is one of more than 120 million pixels; the environment variable ``VEHICLE_DETECTION_MAX_PIXELS`` sets
+    another limit.
 
     >>> read_image("missing.png")
     Traceback (most recent call last):
@@ -112,11 +149,43 @@ def read_image(path: str | os.PathLike[str] | bytes) -> NDArray[np.uint8]:
         raise InvalidInputError(
             f"path must be a file name or bytes, got {describe(path)}; pass bytes(...) or stream.getvalue()"
         )
-    file = check_path(path)
-    if isinstance(path, str) and is_url(path):
-        raise InvalidInputError(f"image file {hide_credentials(path)} is a URL; download it first")
-    name = f"image file {file}"
+    if isinstance(path, str) and is_url(path := local_path(path)):
+        return decode_image(download_bytes(path, Limit.IMAGE_BYTES), f"image {hide_credentials(path)}")
+    name = f"image file {(file := check_path(path))}"
     return decode_image(read_regular_file(file, name, Limit.IMAGE_BYTES), name)
+
+
+def image_array(image: Any) -> NDArray[np.uint8]:
+    """Return the ``(H, W, 3)`` uint8 RGB array of an image: an array, a file or its content, or Pillow's."""
+    if isinstance(image, (str, os.PathLike, bytes)):
+        return read_image(image)
+    if hasattr(image, "mode") and hasattr(image, "convert"):
+        from PIL.ImageOps import exif_transpose
+
+        return np.array(exif_transpose(image).convert("RGB"), np.uint8)
+    return check_image(image)
+
+
+def list_images(source: Any) -> Sequence[Any] | None:
+    """List the images of a folder or a pattern by their names, or those of a list; None for a single image.
+
+    Folders are searched below, too; hidden files are left out.
+    """
+    if isinstance(source, (list, tuple)):
+        return source
+    if not isinstance(source, (str, os.PathLike)) or (isinstance(source, str) and is_url(source)):
+        return None
+    path = check_path(source)
+    if path.is_dir():
+        files = (Path(folder, name) for folder, _, names in os.walk(path) for name in names)
+    elif not path.exists() and glob.has_magic(str(path)):
+        files = map(Path, glob.iglob(str(path), recursive=True))
+    else:
+        return None
+    found = [each for each in files if each.suffix.lower() in IMAGE_SUFFIXES and not is_hidden(each.name)]
+    if not found:
+        raise InvalidInputError(f"image {path} holds no image file, such as .jpg or .png; check the path")
+    return sorted(found, key=lambda each: natural_key(str(each)))
 
 
 def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:

@@ -67,5 +67,6 @@ from vehicle_detection._common.threads import (
     with_spare,
 )
 from vehicle_detection._common.units import ROUGH_DISTANCE, UNITS, Units, format_with_error
+from vehicle_detection._common.web import download_bytes
 
 check_environment()

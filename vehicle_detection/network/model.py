@@ -158,6 +158,13 @@ class NetworkModel(Checked):
         """Probability in the network's output that gives this score, rounded down; undoes `scores`."""
         return to_probability((score + self.threshold - self.offset) / self.slope - 1e-6)
 
+    def name_classes(self, class_ids: NDArray[np.intp]) -> dict[str, NDArray[Any] | None]:
+        """Columns of detections that state their classes; without names, these are unknown."""
+        if self.classes is None:
+            return {"class_ids": class_ids}
+        labels = [self.classes.get(number, str(number)) for number in class_ids.tolist()]
+        return {"class_ids": class_ids, "labels": np.array(labels, np.str_)}
+
     def input_size_for(self, params: NetworkParams) -> int:
         """Longer side of the input in pixels."""
         size = self.input_format.size
@@ -204,8 +211,10 @@ class NetworkSearch(FrameSearch):
     ) -> tuple[Detections, Detections]:
         candidates = self.find_candidates(frame, params, min(min_vehicle_score, params.min_score))
         found = Detections(candidates.boxes, self.model.scores(candidates.probabilities))
-        vehicles = found[greedy_nms(found.boxes, found.scores, max_iou=self.model.nms_iou)]
-        return found[found.scores >= params.min_score], vehicles[vehicles.scores >= min_vehicle_score]
+        kept = greedy_nms(found.boxes, found.scores, max_iou=self.model.nms_iou)
+        kept = kept[found.scores[kept] >= min_vehicle_score]
+        vehicles = found[kept].with_columns(**self.model.name_classes(candidates.class_ids[kept]))
+        return found[found.scores >= params.min_score], vehicles
 
     def find_candidates(
         self, frame: NDArray[np.uint8], params: NetworkParams, min_score: float

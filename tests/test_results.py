@@ -1,0 +1,153 @@
+import shutil
+import sys
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image, ImageShow
+
+from vehicle_detection import Detector, detect
+from vehicle_detection.camera import Camera
+from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.images import read_image, write_image
+
+ROAD, OTHER = "test_images/road1.jpg", "test_images/road2.jpg"
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return Detector("highway")
+
+
+@pytest.fixture(scope="module")
+def expected(detector):
+    return detector.detect(read_image(ROAD)), detector.detect(read_image(OTHER))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "below").mkdir()
+    shutil.copy(ROAD, tmp_path / "a2.jpg")
+    shutil.copy(OTHER, tmp_path / "below" / "a10.jpg")
+    for name in (".hidden.jpg", "notes.txt"):
+        (tmp_path / name).write_text("no image")
+    return tmp_path
+
+
+def test_an_image_may_be_an_array_a_file_bytes_or_of_pillow(detector, expected):
+    with open(ROAD, "rb") as file:
+        data = file.read()
+    for image in (ROAD, data, Image.open(ROAD)):
+        np.testing.assert_array_equal(detector.detect(image).boxes, expected[0].boxes)
+
+
+def test_an_image_of_pillow_is_converted_and_turned(detector, expected):
+    turned = Image.open(ROAD).rotate(90, expand=True)
+    turned.getexif()[0x0112] = 6
+    assert detector.detect(turned).image.shape == (720, 1280, 3)
+    assert detector.detect(Image.open(ROAD).convert("RGBA")).boxes.tolist() == expected[0].boxes.tolist()
+
+
+def test_several_images_give_a_list(detector, expected, folder):
+    for images in ([ROAD, read_image(OTHER)], folder, str(folder / "**" / "*.jpg")):
+        found = detector.detect(images)
+        assert [len(each) for each in found] == [len(each) for each in expected]
+        for one, other in zip(found, expected):
+            np.testing.assert_array_equal(one.boxes, other.boxes)
+    assert [each.path.name for each in detector.detect(folder)] == ["a2.jpg", "a10.jpg"]
+    assert detector.detect([]) == []
+
+
+def test_a_url_is_downloaded(detector, expected, folder):
+    handler = type("Quiet", (SimpleHTTPRequestHandler,), {"log_message": lambda *_: None})
+    server = ThreadingHTTPServer(("127.0.0.1", 0), lambda *args: handler(*args, directory=str(folder)))
+    Thread(target=server.serve_forever, daemon=True).start()
+    address = f"http://127.0.0.1:{server.server_address[1]}"
+    try:
+        found = detector.detect(f"{address}/a2.jpg")
+        assert found.boxes.tolist() == expected[0].boxes.tolist()
+        assert found.path is None
+        with pytest.raises(
+            InvalidInputError, match=r"URL .*nothing.jpg cannot be read \(404.*check the addr"
+        ):
+            detector.detect(f"{address}/nothing.jpg")
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def test_what_is_no_image_is_refused(detector, tmp_path, monkeypatch):
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(16))
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    for image, message in (
+        (tmp_path / "a.heic", "is HEIC, .*pip install pillow-heif"),
+        (str(tmp_path / "*.jpg"), "holds no image file"),
+        ([ROAD, None], "image must be"),
+        (b"x", "the bytes must be a complete image"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            detector.detect(image)
+
+
+def test_the_confidence_of_a_call_is_that_of_a_detector_with_it():
+    for model in ("default", "highway"):
+        with Detector(model, conf=0.7) as general:
+            for conf in (0.1, 0.95):
+                found, wanted = general.detect(ROAD, conf=conf), Detector(model, conf=conf).detect(ROAD)
+                np.testing.assert_array_equal(found.boxes, wanted.boxes)
+                np.testing.assert_allclose(found.scores, wanted.scores)
+                assert (found.confidences >= conf).all()
+            assert len(general.detect(ROAD, conf=0.001)) >= len(general.detect(ROAD))
+
+
+def test_one_line_detects_and_keeps_the_model(expected):
+    found = detect(ROAD, "highway")
+    assert found.boxes.tolist() == expected[0].boxes.tolist()
+    assert len(detect([ROAD, OTHER], "highway")) == 2
+    with VehicleDetector("highway") as detector:
+        assert (
+            detector.detect(ROAD, conf=0.9).boxes.tolist() == detect(ROAD, "highway", conf=0.9).boxes.tolist()
+        )
+
+
+def test_the_picture_is_returned_written_and_shown(detector, tmp_path, monkeypatch):
+    found = detector.detect(ROAD)
+    picture = found.plot(scores=False)
+    changed = (picture != found.image).any(axis=2)
+    x1, y1, x2, _ = found.boxes[0].round().astype(int)
+    assert changed[y1, x1:x2].all()
+    found.save(tmp_path / "out.png", scores=False)
+    np.testing.assert_array_equal(read_image(tmp_path / "out.png"), picture)
+    shown = []
+    monkeypatch.setattr(ImageShow, "show", lambda image, title: shown.append(image.size) or True)
+    found[:1].show()
+    assert shown == [(1280, 720)]
+    monkeypatch.setattr(ImageShow, "show", lambda image, title: False)
+    with pytest.raises(InvalidInputError, match="use save"):
+        found.show()
+    monkeypatch.setitem(
+        sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: SimpleNamespace(kernel=1))
+    )
+    display = SimpleNamespace(display=lambda picture: shown.append(picture.size))
+    monkeypatch.setitem(sys.modules, "IPython.display", display)
+    found.show()
+    assert len(shown) == 2
+
+
+def test_distances_need_a_camera(detector):
+    found = detector.detect(ROAD)
+    near, far = (found.distances(Camera.dashcam(fov=fov, horizon=0.55)) for fov in (90, 45))
+    assert near.shape == (2, len(found))
+    assert (far[0] > 1.5 * near[0]).all()
+    assert (near[1] > 0).all()
+
+
+def test_files_are_read_again_for_the_picture(detector, tmp_path):
+    write_image(tmp_path / "road.png", read_image(ROAD))
+    found = detector.detect(tmp_path / "road.png")
+    (tmp_path / "road.png").unlink()
+    with pytest.raises(InvalidInputError, match="does not exist"):
+        found.plot()
