@@ -59,6 +59,8 @@ _CLIP_RATE = 6.0
 # Longer side to which frames are reduced, and that of the network's input (px).
 _MAX_SIDE, _INPUT_SIZE = 720, 640
 _STEPS, _NMS_IOU = 9000, 0.5
+# By how much its boxes are too large: medians over seven sources of labels, of both networks.
+_MARGINS = (0.5, 0.01, 1.0)
 
 
 def load_sources(folder: Path, *, held_out: bool = False) -> list[FrameDataset]:
@@ -98,7 +100,8 @@ def make_file(
     metadata
         Facts to store.
     """
-    params = {"input_size": _INPUT_SIZE, "slope": 1.0, "offset": 0.0, "threshold": 0.0, "nms_iou": _NMS_IOU}
+    params: dict[str, Any] = {"input_size": _INPUT_SIZE, "slope": 1.0, "offset": 0.0, "threshold": 0.0}
+    params |= {"nms_iou": _NMS_IOU, "margins": _MARGINS}
     facts = dict(metadata or {})
     if folds:
         slope, offset = fit_log_odds(folds)

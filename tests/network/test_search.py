@@ -170,6 +170,25 @@ def test_a_file_that_is_too_large(file, monkeypatch):
         load_network(file)
 
 
+def test_margins_of_boxes_are_trimmed_inside_the_frame(tmp_path):
+    found = []
+    for margins in ((0, 0, 0), (0.5, 0.01, 1)):
+        (tmp_path / "own.onnx").write_bytes(own_network(params=PARAMS | {"margins": margins}))
+        search = load_network(tmp_path / "own.onnx").open_search(jobs=1)
+        found.append(search.find_candidates(IMAGE, search.params_type(), -9.0))
+    both = np.isin(found[0].probabilities, found[1].probabilities)  # a box may have been a margin alone
+    boxes = found[0].boxes[both]
+    moved = found[1].boxes - boxes
+    height, width = IMAGE.shape[:2]
+    whole = ((boxes > 2) & (boxes < [width - 2, height, width - 2, height])).all(1)
+    assert whole.sum() > 10
+    assert (moved[whole] @ np.diag([1, 1, -1, 1]) >= 0).all()
+    assert (moved[whole, :3] != 0).all()
+    at_edge = boxes == [0, 0, width, height]
+    assert at_edge.any()
+    assert not moved[at_edge].any()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -177,6 +196,7 @@ def test_a_file_that_is_too_large(file, monkeypatch):
         ({"params": PARAMS | {"slope": -1}}, "slope"),
         ({"params": PARAMS | {"slope": "steep"}}, "steep"),
         ({"params": PARAMS | {"nms_iou": 2}}, "nms_iou"),
+        ({"params": PARAMS | {"margins": [1, -2, 0]}}, "margins"),
         ({"params": PARAMS | {"input_size": 100}}, "multiple of 32"),
         ({"size": (64, "width")}, "both sides fixed"),
     ],

@@ -103,6 +103,9 @@ def _own_model(graph: bytes, facts: GraphFacts) -> NetworkModel:
         size = int(params["input_size"])
         NetworkParams(input_size=size)
         scores: Any = {name: float(params[name]) for name in ("slope", "offset", "threshold", "nms_iou")}
+        side, share, top = map(float, params.get("margins", (0, 0, 0)))
+        if not all(0 <= margin < 100 for margin in (side, share, top)):
+            raise ValueError(f"margins {params['margins']}")
         is_image = image.dtype == "uint8" and len(image.shape) == 4
         if not is_image or len(boxes.shape) != 3 or boxes.shape[1] not in (5, None):
             raise ValueError(f"input {image.dtype} {image.shape}, output {boxes.shape}")
@@ -113,6 +116,7 @@ def _own_model(graph: bytes, facts: GraphFacts) -> NetworkModel:
             output_format=OutputFormat("columns", 1),
             input_name=image.name,
             input_size=size,
+            margins=(side, share, top),
             classes={0: "vehicle"},
             metadata=dict(header["metadata"]),
             **scores,

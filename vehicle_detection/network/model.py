@@ -24,6 +24,9 @@ from vehicle_detection.search import FrameSearch
 INPUT_SIZE = 640
 """Longer side of the input of a network without fixed sizes."""
 
+Margins = tuple[float, float, float]
+"""Margins of boxes: at each side in pixels and as a share of the width, and at the top in pixels."""
+
 # Probabilities of exactly 0 and 1 have no finite log-odds.
 _MIN_PROBABILITY = 1e-4
 
@@ -85,6 +88,8 @@ class NetworkModel(Checked):
         Minimum of these log-odds of a vehicle.
     nms_iou
         IoU above which the less probable of two boxes is dropped.
+    margins
+        By how much boxes of the network are too large, see `trim`.
     input_name, extra_inputs
         Name of the input that gets the image, and the other inputs, which get its width and height.
     device, runtime
@@ -114,6 +119,7 @@ class NetworkModel(Checked):
     offset: float = number(0.0, low=-1e9, high=1e9)
     threshold: float = number(0.0, low=-1e9, high=1e9)
     nms_iou: float = number(0.6, low=0, high=1)
+    margins: Margins = (0.0, 0.0, 0.0)
     device: Device = "cpu"
     runtime: Runtime = "auto"
     metadata: Mapping[str, Any] = field(default_factory=dict)
@@ -236,7 +242,8 @@ class NetworkSearch(FrameSearch):
         # From the input, in which the frame has the size `scaled`, to pixels of the frame.
         height, width = frame.shape[:2]
         factors = np.array([width / scaled[1], height / scaled[0]] * 2)
-        boxes = np.clip(found.boxes * factors, 0.0, [width, height, width, height])
+        trimmed = trim(found.boxes, model.margins, scaled)
+        boxes = np.clip(trimmed * factors, 0.0, [width, height, width, height])
         inside = box_areas(boxes) > 0
         return Candidates(boxes[inside], found.probabilities[inside], found.class_ids[inside])
 
@@ -269,6 +276,28 @@ def _after_fork() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
+
+
+def trim(boxes: Floats, margins: Margins, size: Size) -> Floats:
+    """Boxes without their margins; edges at those of the frame, of this height and width, stay.
+
+    The network learns from frames whose edges are blurred over a pixel, and encloses the blur.
+
+    >>> trim(np.array([[10.0, 20.0, 110.0, 100.0], [0.0, 20.0, 100.0, 100.0]]), (0.5, 0.01, 1.0), (360, 640))
+    array([[ 11.5,  21. , 108.5, 100. ],
+           [  0. ,  21. ,  98.5, 100. ]])
+    """
+    side, share, top = margins
+    x1, y1, x2, y2 = boxes.T
+    inset = np.minimum(side + share * (x2 - x1), (x2 - x1) / 4)
+    return np.column_stack(
+        [
+            np.where(x1 > 1, x1 + inset, x1),
+            np.where(y1 > 1, y1 + np.minimum(top, (y2 - y1) / 4), y1),
+            np.where(x2 < size[1] - 1, x2 - inset, x2),
+            y2,
+        ]
+    )
 
 
 def to_log_odds(probabilities: Floats) -> Floats:

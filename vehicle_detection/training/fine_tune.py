@@ -203,9 +203,10 @@ def package_versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name.replace("_", "-")) for name in names}
 
 
-def file_params(model: NetworkModel) -> dict[str, float]:
+def file_params(model: NetworkModel) -> dict[str, Any]:
     """Return the parameters of a network for its file."""
-    return {name: getattr(model, name) for name in ("input_size", "slope", "offset", "threshold", "nms_iou")}
+    names = ("input_size", "slope", "offset", "threshold", "nms_iou", "margins")
+    return {name: getattr(model, name) for name in names}
 
 
 def load_content(content: bytes) -> NetworkModel:
