@@ -52,6 +52,7 @@ from vehicle_detection.drawing import (
     draw_text,
     fill_rectangle,
     heat_image,
+    hidden_area,
     line_width_for,
     round_box,
     text_scale,
@@ -193,6 +194,7 @@ class BirdsEyePanel:
         self._text_scale = max(0.3, min(0.4 * math.sqrt(height / 300) * enlarged, 4.0))
         self._line = max(1, round(height / _LINE_HEIGHT))
         self._has_text = height >= _MIN_TEXT_HEIGHT
+        self._texts: list[Rectangle] = []  # of the grid
         self._grid = self._draw_grid(height, width, units)
         self._dark = (self._grid * _BACKGROUND_ALPHA).astype(np.uint8)
         self._trails: dict[int, Trail] = {}  # by track id
@@ -229,7 +231,7 @@ class BirdsEyePanel:
         shown = [
             (position, track, color)
             for track, color in zip(tracks, colors, strict=True)
-            if (position := positions[track.id]) is not None and position.distance_m < _AHEAD_M
+            if (position := positions[track.id]) is not None and self._holds(position, camera)
         ]
         # Far to near, and all ellipses below all vehicles.
         shown.sort(key=lambda entry: -entry[0].distance_m)
@@ -240,9 +242,14 @@ class BirdsEyePanel:
             cv2.polylines(view, [np.array(trail, np.int32)], False, color, self._line, cv2.LINE_AA, _SHIFT)
             self._draw_vehicle(view, track, position, color, camera)
         if self._has_text:
-            for position, track, _ in shown:
-                self._write_number(view, track, position)
+            self._write_numbers(view, [(position, track.id) for position, track, _ in shown], camera)
         return left, 0, left + width, height
+
+    def _holds(self, position: RoadPosition, camera: Camera) -> bool:
+        """Whether a vehicle lies in the view as a whole."""
+        side = abs(position.lateral_m) + camera.vehicle_width_m / 2
+        ahead = position.distance_m + camera.vehicle_length_m
+        return ahead <= _AHEAD_M and side <= self._width / 2 / self._scale
 
     def _update_trails(self, time: float, points: Mapping[int, Point | None]) -> None:
         """Add the points of a frame, at most one per 0.08 s and track."""
@@ -268,7 +275,10 @@ class BirdsEyePanel:
             scale = self._text_scale
             text = f"{distance} {chosen.distance_symbol}"
             if self._has_text:
-                draw_text(grid, [text], 0, y - cap_height(scale) - 6, scale, _TEXT_COLOR)
+                top = y - cap_height(scale) - 6
+                draw_text(grid, [text], 0, top, scale, _TEXT_COLOR)
+                right, bottom = np.add((0, top), text_size([text], scale)).tolist()
+                self._texts.append((0, top, right, bottom))
         length, half = 4.2, 0.9
         corners = [(-half, -length), (half, -length), (half, -1.2), (0.0, 0.3), (-half, -1.2)]
         cv2.fillPoly(grid, [self._pixels(corners)], _OWN_COLOR, cv2.LINE_AA, _SHIFT)
@@ -305,13 +315,25 @@ class BirdsEyePanel:
             tip = min(0.4, max(3.0, self._scale) / max(abs(last[1] - first[1]), 1))
             cv2.arrowedLine(panel, first, last, _OWN_COLOR, self._line, cv2.LINE_AA, 0, tip)
 
-    def _write_number(self, panel: Image, track: Track, position: RoadPosition) -> None:
-        """Write the number of a track beside its vehicle."""
-        text = [f"{track.id}"]
-        width, height = text_size(text, self._text_scale)
-        x = min(max(self._column(position.lateral_m + 1.2), 0), self._width - width)
-        y = min(max(self._row(position.distance_m) - height, 0), len(panel) - height)
-        draw_text(panel, text, x, y, self._text_scale, _OWN_COLOR)
+    def _write_numbers(self, panel: Image, shown: list[tuple[RoadPosition, int]], camera: Camera) -> None:
+        """Write the numbers of tracks beside their vehicles, nearest ones first, where nothing is hidden."""
+        half, length = camera.vehicle_width_m / 2 + 0.3, camera.vehicle_length_m
+        taken: list[Rectangle] = list(self._texts)
+        for (x, z, *_), _ in shown:
+            left, right = self._column(x - half), self._column(x + half)
+            taken.append((left, self._row(z + length), right, self._row(z)))
+        vehicles = taken[len(self._texts) :]
+        for (_, track_id), (left, top, right, bottom) in reversed(list(zip(shown, vehicles))):
+            text = [str(track_id)]
+            width, height = text_size(text, self._text_scale)
+            row, column = (top + bottom - height) // 2, (left + right - width) // 2
+            for x, y in ((right, row), (left - width, row), (column, bottom), (column, top - height)):
+                place = x, y, x + width, y + height
+                inside = x >= 0 and y >= 0 and place[2] <= self._width and place[3] <= len(panel)
+                if inside and not hidden_area(place, taken):
+                    draw_text(panel, text, x, y, self._text_scale, _OWN_COLOR)
+                    taken.append(place)
+                    break
 
     def _column(self, lateral_m: float) -> int:
         return round(self._width / 2 + lateral_m * self._scale)

@@ -290,7 +290,7 @@ def _least_hiding(places: Iterable[Place], obstacles: Sequence[Rectangle], last:
     """Return the place that hides least, where the last one counts less."""
 
     def hidden(place: Place) -> float:
-        return _hidden_area(place[1], obstacles) * (_LAST_WEIGHT if place[0] == last else 1.0)
+        return hidden_area(place[1], obstacles) * (_LAST_WEIGHT if place[0] == last else 1.0)
 
     return min(places, key=hidden)  # the first one of equals, the best
 
@@ -338,7 +338,8 @@ def _leader(box: Rectangle, label: Rectangle) -> tuple[tuple[int, int], tuple[in
     return (min(max(x, box[0]), box[2] - 1), start), (x, end)
 
 
-def _hidden_area(label: Rectangle, obstacles: Sequence[Rectangle]) -> int:
+def hidden_area(label: Rectangle, obstacles: Sequence[Rectangle]) -> int:
+    """Pixels of obstacles that a label covers."""
     area = 0
     for x1, y1, x2, y2 in obstacles:
         width, height = min(label[2], x2) - max(label[0], x1), min(label[3], y2) - max(label[1], y1)

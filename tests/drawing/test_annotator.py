@@ -21,7 +21,7 @@ from vehicle_detection.annotator import (
 )
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
-from vehicle_detection.drawing import TRACK_COLORS, blur_boxes
+from vehicle_detection.drawing import TRACK_COLORS, blur_boxes, color_index
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes import SceneVehicle, render_scene
 from vehicle_detection.tracking import FrameResult
@@ -234,6 +234,31 @@ class TestPanel:
             assert (top, right) == (0, shape[1])
             assert (bottom, right - left) == BirdsEyePanel.corner_size(shape)
             assert bottom < 0.45 * shape[0]
+
+    @pytest.mark.parametrize(("distance", "shown"), [(75.0, True), (78.0, False), (90.0, False)])
+    def test_a_vehicle_at_the_edge_is_left_out_whole(self, distance, shown):
+        ahead = track((600, 400, 640, 430), distance_m=distance, distance_std_m=0.1, speed_mps=None)
+        drawn = Annotator(SIDE, camera=CAMERA).draw_tracks(blank(), [ahead])
+        assert (drawn[:, 1280:] == TRACK_COLORS[0]).all(axis=2).any() == shown
+
+    def test_numbers_hide_neither_vehicles_nor_each_other(self):
+        """A crowd: every pixel of the vehicles is as without numbers."""
+        crowd = [
+            track((560 + 9 * n, 400, 620 + 9 * n, 440), id=100 + n, distance_m=20.0 + n, distance_std_m=0.1)
+            for n in range(8)
+        ]
+        crowd = [dataclasses.replace(each, speed_mps=None) for each in crowd]
+        colors = [TRACK_COLORS[color_index(each.id)] for each in crowd]
+        panel = BirdsEyePanel(SHAPE, "corner")
+        with_numbers, without = blank(), blank()
+        panel.draw(with_numbers, crowd, colors, CAMERA, SHAPE, 0.0)
+        panel = BirdsEyePanel(SHAPE, "corner")
+        panel._has_text = False
+        panel.draw(without, crowd, colors, CAMERA, SHAPE, 0.0)
+        vehicles = np.any([(without == color).all(axis=2) for color in colors], axis=0)
+        assert vehicles.sum() > 200
+        assert (with_numbers[vehicles] == without[vehicles]).all()
+        assert (with_numbers != without).any()
 
     def test_a_vehicle_is_at_its_place(self):
         """A vehicle in the own lane: in the middle, and the farther the higher."""

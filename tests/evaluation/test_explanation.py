@@ -17,7 +17,7 @@ from vehicle_detection import (
 )
 from vehicle_detection.drive import explain_tracks
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.explanation import patch_cell_shares
+from vehicle_detection.evaluation.explanation import Explanation, patch_cell_shares
 from vehicle_detection.features import part_slices
 from vehicle_detection.function_model import FunctionModel
 from vehicle_detection.scenes import SceneVehicle
@@ -48,6 +48,7 @@ def test_each_found_vehicle_is_explained(detector):
         assert explanation.cells.shape == (6, 6)
         assert explanation.cells.max() > 0
         assert f"score {score:.2f}: margin {score:.2f}" in str(explanation)
+        assert explanation.describe().startswith("A vehicle is found here: the ")
 
 
 def test_a_box_without_a_vehicle_is_explained_too(detector):
@@ -57,6 +58,24 @@ def test_a_box_without_a_vehicle_is_explained_too(detector):
     assert explanation.margin < 0
     assert explanation.box.tolist() == [60, 230, 130, 290]
     assert str(explanation).startswith("not found: margin -")
+    assert explanation.describe().startswith("No vehicle is found here")
+
+
+@pytest.mark.parametrize(
+    ("cells", "text"),
+    [
+        (np.pad(np.ones((2, 2)), 2), "the center speaks for it"),
+        (np.pad(-np.ones((2, 2)), ((4, 0), (0, 4))), "the lower left speaks against it"),
+        (
+            np.pad([[2.0, -1.0]], ((2, 0), (0, 1))),
+            "the lower left speaks for it; the lower middle speaks against it",
+        ),
+        (np.zeros((6, 6)), "no part stands out"),
+    ],
+)
+def test_words_name_the_parts_that_matter(cells, text):
+    box = np.array([0.0, 0, 60, 60])
+    assert Explanation(box, True, box, np.asarray(cells, float), {}, 1.0).describe().endswith(f"{text}.")
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +156,7 @@ def test_a_detected_box_of_a_track_is_explained(detector, tmp_path, seconds, fra
         )
     (picture,) = explain_tracks(detector, tmp_path, table)
     assert (picture.track, picture.frame) == (1, frame)
-    assert "margin" in picture.text
+    assert picture.text.startswith("A vehicle is found here")
     assert "not found" not in picture.text
 
 

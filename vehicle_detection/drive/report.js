@@ -39,7 +39,9 @@ function moveLine(name, frame) {
 function showReadout(frame) {
   const visible = data.tracks.filter(track => track.spans.some(([from, to]) => from <= frame && frame < to));
   const time = document.createElement("b");
-  time.textContent = formatTime(frame / data.fps) + (visible.length ? "" : " no vehicle");
+  const own = data.own[Math.floor(frame / data.step)];
+  time.textContent = formatTime(frame / data.fps) + (own == null ? "" : " own speed " + Math.round(own) + " " + data.units[1]);
+  if (!visible.length) time.textContent += " no vehicle";
   readout.replaceChildren(time, ...visible.map(track => {
     const index = Math.floor(frame / data.step) - track.first, name = document.createElement("span");
     const distance = track.distance[index], speed = track.speed[index];
@@ -48,16 +50,59 @@ function showReadout(frame) {
     if (distance != null) name.textContent += (track.rough[index] ? " ~" : " ") + distance.toFixed(0) + " " + data.units[0];
     if (speed != null) {
       const rounded = Math.round(speed), sign = rounded > 0 ? "+" : rounded < 0 ? "\u2212" : "";
-      name.textContent += " " + sign + Math.abs(rounded) + " " + data.units[1];
+      name.textContent += " " + sign + Math.abs(rounded) + " " + data.units[1] + (own == null ? "" : " relative");
     }
     return name;
   }));
 }
 
+// Zoomed charts are wider than their column and scroll together.
+const zoomBar = document.querySelector(".zoom"), scrolls = [...document.querySelectorAll(".scroll")];
+const length = data.frames / data.fps, maxZoom = 2 ** Math.floor(Math.log2(Math.max(length / 10, 1)));
+let zoom = 1;
+const allTimes = [...document.querySelectorAll(".times")].map(group => [group, group.innerHTML]);
+function drawTimes() {
+  const steps = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600];
+  const step = steps.find(each => length / zoom / each < 6) || 3600;
+  for (const [group, markup] of allTimes) {
+    group.innerHTML = markup;
+    if (zoom === 1) continue;
+    const [line, text] = [group.querySelector("line"), group.querySelector("text")];
+    group.replaceChildren();
+    for (let time = 0; time <= length; time += step) {
+      const copies = [line.cloneNode(), text.cloneNode()], x = time / length * 100 + "%";
+      for (const name of ["x1", "x2"]) copies[0].setAttribute(name, x);
+      copies[1].setAttribute("x", x);
+      copies[1].setAttribute("text-anchor", time ? "middle" : "start");
+      copies[1].textContent = formatTime(time).slice(0, -2);
+      group.append(...copies);
+    }
+  }
+}
+function scrollCharts(frame) {
+  for (const each of scrolls) each.scrollLeft = (frame + .5) / data.frames * each.scrollWidth - each.clientWidth / 2;
+}
+function setZoom(value) {
+  const hidden = scrolls[0].scrollWidth > scrolls[0].clientWidth, center = zoom > 1 && hidden
+    ? (scrolls[0].scrollLeft + scrolls[0].clientWidth / 2) / scrolls[0].scrollWidth * data.frames : current;
+  zoom = Math.min(Math.max(value, 1), maxZoom);
+  document.body.classList.toggle("zoomed", zoom > 1);
+  for (const each of scrolls) each.firstChild.style.width = zoom * 100 + "%";
+  zoomBar.querySelector("output").textContent = zoom > 1 ? formatTime(length / zoom).slice(0, -2) + " of " + formatTime(length).slice(0, -2) : "whole video";
+  for (const button of zoomBar.querySelectorAll("button"))
+    button.disabled = Number(button.dataset.factor) > 1 ? zoom >= maxZoom : zoom <= 1;
+  drawTimes();
+  scrollCharts(center);
+}
+for (const each of scrolls) each.addEventListener("scroll", () => {
+  for (const other of scrolls) if (Math.abs(other.scrollLeft - each.scrollLeft) >= 1) other.scrollLeft = each.scrollLeft;
+});
+
 let current = 0, hovering = false;
 function updatePlayhead() {
   if (video) current = clampFrame(Math.floor(video.currentTime * data.fps + .01));
   moveLine("playhead", current);
+  if (zoom > 1 && video && !video.paused) scrollCharts(current);
   if (!hovering) showReadout(current);
   if (video && !video.paused && !video.ended) requestAnimationFrame(updatePlayhead);
 }
@@ -88,6 +133,13 @@ for (const plot of document.querySelectorAll(".plot")) {
   plot.addEventListener("click", event => {
     if (!event.target.closest("[data-frame]")) seek(frameAt(event));
   });
+}
+
+if (zoomBar && maxZoom > 1) {
+  zoomBar.hidden = false;
+  for (const button of zoomBar.querySelectorAll("button"))
+    button.addEventListener("click", () => setZoom(zoom * Number(button.dataset.factor)));
+  setZoom(1);
 }
 
 // Fade all tracks but one; null fades none.

@@ -117,11 +117,12 @@ class ReportWriter:
             `TrackPicture` objects to list below the tracks.
         """
         check_type(report, "report", VideoReport, "pass what process_video returned")
+        fps = float(report.fps)
+        own = getattr(getattr(self._detector, "annotator", None), "own_speed", None)
+        speeds = None if own is None else own_speeds(own, self.table, fps=fps)
         if events is None:
-            camera, fps = getattr(self._detector, "camera", None), float(report.fps)
+            camera = getattr(self._detector, "camera", None)
             camera = camera.for_shape(report.shape) if isinstance(camera, Camera) else None
-            own = getattr(getattr(self._detector, "annotator", None), "own_speed", None)
-            speeds = None if own is None else own_speeds(own, self.table, fps=fps)
             events = find_events(self.table, fps=fps, shape=report.shape, camera=camera, own_speed_mps=speeds)
         listed = check_sequence(pictures, "pictures", "TrackPicture")
         for picture in listed:
@@ -138,6 +139,7 @@ class ReportWriter:
             detector=self._detector,
             units=self._units,
             pictures=listed,
+            own_speed_mps=speeds,
         )
         with (
             atomic_write(self._path, "path") as part,
@@ -195,7 +197,7 @@ def explain_tracks(
                 for _, _, image in frames:
                     explanation = explain(detector, image, track.boxes[row])
                     picture = _draw_explanation(detector, image, explanation)
-                    pictures.append(TrackPicture(track.id, frame, picture, str(explanation)))
+                    pictures.append(TrackPicture(track.id, frame, picture, explanation.describe()))
     return sorted(pictures, key=lambda picture: picture.track)
 
 

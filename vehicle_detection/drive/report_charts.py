@@ -54,8 +54,8 @@ class TimeAxis:
 
     @property
     def bin_width(self) -> int:
-        """Frames per point of a curve, of which there are at most 800."""
-        return math.ceil(self.frames / 800)
+        """Frames per point of a curve, of which there are at most 2000."""
+        return math.ceil(self.frames / 2000)
 
     def percent(self, frame: float) -> str:
         """Position of the beginning of a frame, as a percentage of the width."""
@@ -138,7 +138,7 @@ def gantt(tracks: Sequence[TrackHistory], axis: TimeAxis, *, label: str) -> str:
         times = f"{format_time(track.first / axis.fps)} to {format_time((track.last + 1) / axis.fps)}"
         parts = [svg_element("title", f"{name}, {times}")]
         bar = {"y": _decimal(middle - _BAR_HEIGHT / 2), "height": _BAR_HEIGHT, "rx": 3}
-        for start, stop in track.spans(max(1, axis.frames // _CURVE_WIDTH)):
+        for start, stop in track.spans(axis.bin_width):
             parts.append(svg_element("rect", x=axis.percent(start), width=axis.percent(stop - start), **bar))
         bars.append(_seek_button(parts, f"Track {track.id}, {times}", track.first, track.id))
     height = _ROW_HEIGHT * (max(rows, default=-1) + 1)
@@ -198,21 +198,35 @@ def _graph(
     lines = [svg_element("line", class_=name, x1=0, x2=0, y1=0, y2=height) for name in ("cursor", "playhead")]
     total = height + 20  # the times are below the chart
     side = svg_element("svg", *values, class_="values", width=44, height=total, aria_hidden="true")
-    parts = [*times, *content, *lines]
+    parts = [svg_element("g", *times, class_="times"), *content, *lines]
     plot = svg_element("svg", *parts, class_="plot", width="100%", height=total, role=role, aria_label=label)
-    return f'<div class="graph">{side}{plot}</div>'
+    return f'<div class="graph">{side}<div class="scroll">{plot}</div></div>'
 
 
 def curve(
     track: TrackHistory, name: str, time_axis: TimeAxis, value_axis: ValueAxis, *, std: str | None = None
 ) -> str:
     """Draw a column of a track as a line; `std` names the column whose values give a band around it."""
-    bins, values = bin_means(track.frames, track.columns[name], time_axis.bin_width)
+    stds = None if std is None else track.columns[std]
+    paths = curve_paths(track.frames, track.columns[name], time_axis, value_axis, stds=stds)
+    return svg_element("g", *paths, class_=f"curve c{track.color}", data_track=track.id) if paths else ""
+
+
+def curve_paths(
+    frames: NDArray[np.int64],
+    series: Floats,
+    time_axis: TimeAxis,
+    value_axis: ValueAxis,
+    *,
+    stds: Floats | None = None,
+) -> list[str]:
+    """Draw values of frames as a line, with a band of their standard errors; nothing if all are NaN."""
+    bins, values = bin_means(frames, series, time_axis.bin_width)
     half_widths = np.zeros(len(bins))
-    if std is not None:
+    if stds is not None:
         # Standard errors of the frames with a known value only, as for the line.
-        known = np.where(np.isfinite(track.columns[name]), track.columns[std], np.nan)
-        std_bins, std_values = bin_means(track.frames, known, time_axis.bin_width)
+        known = np.where(np.isfinite(series), stds, np.nan)
+        std_bins, std_values = bin_means(frames, known, time_axis.bin_width)
         half_widths[np.searchsorted(bins, std_bins)] = std_values
     lines, bands = [], []
     for run in split_runs(bins):
@@ -220,15 +234,12 @@ def curve(
         # A single point gets a short line, as a line without length is invisible.
         end = max(time_axis.bin_width / time_axis.frames * _CURVE_WIDTH, 2) if len(points) == 1 else 0
         lines.append(f"M{' '.join(points)}" + (f"h{_decimal(end)}" if end else ""))
-        if std is not None:
+        if stds is not None:
             upper = _points(bins[run], values[run] + half_widths[run], time_axis, value_axis)
             lower = _points(bins[run], values[run] - half_widths[run], time_axis, value_axis)
             bands.append(f"M{' '.join(upper + lower[::-1])}Z")
-    if not lines:
-        return ""
-    paths = [svg_element("path", class_="band", d="".join(bands))] if bands else []
-    paths.append(svg_element("path", class_="line", d="".join(lines)))
-    return svg_element("g", *paths, class_=f"curve c{track.color}", data_track=track.id)
+    shapes = {"band": "".join(bands), "line": "".join(lines)}
+    return [svg_element("path", class_=name, d=shape) for name, shape in shapes.items() if shape]
 
 
 def end_labels(

@@ -30,16 +30,17 @@ from vehicle_detection.drive.report_charts import (
     chart,
     count_bars,
     curve,
+    curve_paths,
     end_labels,
     event_markers,
     format_time,
     format_value,
     fraction_bar,
     gantt,
+    svg_element,
 )
 from vehicle_detection.heatmap import HeatParams
 from vehicle_detection.tables import TrackTable
-from vehicle_detection.training import split_table
 from vehicle_detection.video import VideoReport
 
 _COUNT_SECONDS = (1, 2, 5, 10, 15, 30, 60, 120, 300)  # durations of a bar in the chart of counts
@@ -97,11 +98,10 @@ class Table(NamedTuple):
 
 
 class Group(NamedTuple):
-    """Named values that the reader can unfold, below an optional table."""
+    """Named values that the reader can unfold."""
 
     title: str
     values: Mapping[str, Any]
-    table: Table | None = None
 
 
 def render_page(
@@ -114,16 +114,18 @@ def render_page(
     detector: Any,
     units: str = "metric",
     pictures: Sequence[TrackPicture] = (),
+    own_speed_mps: Floats | None = None,
 ) -> Iterator[str]:
-    """Render the page in pieces; `detector` may lack settings or a model, which are then left out."""
+    """Render the page in pieces; `detector` may lack settings or a model, which are then left out.
+
+    `own_speed_mps` is the camera's speed over ground in each frame of the table, if it is known.
+    """
     from jinja2 import Environment, StrictUndefined
 
     axis = TimeAxis(max(report.frames, len(table.counts()), 1), float(report.fps))
     chosen = UNITS[units]
-    # Labels in the video state speeds over ground where the own speed is known.
-    own = getattr(getattr(detector, "annotator", None), "own_speed", None)
-    symbols = [chosen.distance_symbol, chosen.speed_symbol + " relative" * (own is not None)]
-    tracks = [_for_page(track, chosen) for track in track_histories(table)]
+    own = None if own_speed_mps is None else own_speed_mps * chosen.speed
+    tracks = [_for_page(track, chosen, own) for track in track_histories(table)]
     folder, names = files("vehicle_detection.drive"), ("report.css", "report.js", "report.html.j2")
     css, script, template = (folder.joinpath(name).read_text(encoding="utf-8") for name in names)
     environment = Environment(
@@ -144,7 +146,7 @@ def render_page(
         counts=_counts(tracks, table, report, chosen),
         video=video,
         tracks=tracks,
-        figures=_figures(tracks, table, events, axis, chosen) if tracks else [],
+        figures=_figures(tracks, table, events, axis, chosen, own) if tracks else [],
         events=events,
         event_kinds=KINDS,
         pictures=pictures,
@@ -153,7 +155,7 @@ def render_page(
         settings=_settings(detector, report.shape),
         model=_model_summary(getattr(detector, "model", None)),
         version=vehicle_detection.__version__,
-        data=_script_data(tracks, axis) | {"units": symbols},
+        data=_script_data(tracks, axis, own) | {"units": [chosen.distance_symbol, chosen.speed_symbol]},
     )
 
 
@@ -162,14 +164,19 @@ def _csp_hash(code: str) -> str:
     return f"sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}"
 
 
-def _for_page(track: TrackHistory, units: Units) -> TrackHistory:
-    """Hide speeds with a large standard error, as in the video, and convert the columns to other units."""
+def _for_page(track: TrackHistory, units: Units, own: Floats | None) -> TrackHistory:
+    """Convert the columns to other units, hide speeds with a large standard error, as the video does.
+
+    The column ``ground_speed`` is added, if the `own` speed is known.
+    """
     imprecise = track.columns["speed_std_mps"] > MAX_SPEED_STD
     speeds = np.where(imprecise, np.nan, track.columns["speed_mps"])
     factors = {"distance_m": units.distance, "distance_std_m": units.distance}
     factors |= {"speed_mps": units.speed, "speed_std_mps": units.speed}
     columns = track.columns | {"speed_mps": speeds}
     converted = {name: factors.get(name, 1.0) * values for name, values in columns.items()}
+    if own is not None:
+        converted["ground_speed"] = converted["speed_mps"] + own[track.frames]
     return dataclasses.replace(track, columns=converted)
 
 
@@ -226,18 +233,22 @@ def _minute_table(counts: VehicleCounts, fps: float) -> Table:
 
 
 def _figures(
-    tracks: Sequence[TrackHistory], table: TrackTable, events: Sequence[Event], axis: TimeAxis, units: Units
+    tracks: Sequence[TrackHistory],
+    table: TrackTable,
+    events: Sequence[Event],
+    axis: TimeAxis,
+    units: Units,
+    own: Floats | None,
 ) -> list[Figure]:
     label = f"Bars of {pluralize(len(tracks), 'track')}: when each was shown, as in the table of tracks."
-    distances = [track.columns["distance_m"] for track in tracks]
-    speeds = [bin_means(track.frames, track.columns["speed_mps"], axis.bin_width)[1] for track in tracks]
     marked = event_markers(events, axis, units, label=f"Markers of {pluralize(len(events), 'event')}.")
     return [
         Figure("Tracks", "When each vehicle was shown", gantt(tracks, axis, label=label)),
         *([Figure("Events", "What the table of events lists", marked)] if events else []),
         _count_figure(table, axis),
-        _curve_figure("distance", np.concatenate(distances), tracks, axis, units),
-        _curve_figure("relative speed", np.concatenate(speeds), tracks, axis, units),
+        _curve_figure("distance", tracks, axis, units),
+        *([_curve_figure("speed over ground", tracks, axis, units, own)] if own is not None else []),
+        _curve_figure("relative speed", tracks, axis, units),
     ]
 
 
@@ -256,49 +267,73 @@ def _count_figure(table: TrackTable, axis: TimeAxis) -> Figure:
 
 
 def _curve_figure(
-    quantity: str, values: Floats, tracks: Sequence[TrackHistory], axis: TimeAxis, units: Units
+    quantity: str,
+    tracks: Sequence[TrackHistory],
+    axis: TimeAxis,
+    units: Units,
+    own: Floats | None = None,
 ) -> Figure:
-    """Lines of the distance or of the relative speed of each track."""
-    known = values[np.isfinite(values)]
+    """Lines of the distance, the speed over ground or the relative speed of each track, and the own speed."""
+    error = f"standard error at most {units.speed * MAX_SPEED_STD:.0f} {units.speed_symbol}"
+    column, std, symbol, note = {
+        "distance": (
+            "distance_m", "distance_std_m", units.distance_name,
+            f"{units.distance_name.capitalize()} along the road; the band is one standard error",
+        ),
+        "speed over ground": (
+            "ground_speed", None, units.speed_symbol,
+            f"{units.speed_name.capitalize()}, below 0 for oncoming vehicles; dashed: the own speed",
+        ),
+        "relative speed": (
+            "speed_mps", None, units.speed_symbol,
+            f"{units.speed_name.capitalize()} relative to the camera, above 0 when moving away; {error}",
+        ),
+    }[quantity]  # fmt: skip
+    series = [bin_means(track.frames, track.columns[column], axis.bin_width)[1] for track in tracks]
+    known = np.concatenate([*series, [] if own is None else own[np.isfinite(own)]])
     if not known.size:
         return Figure(quantity.capitalize(), f"No {quantity} is known.")
     low, high = float(known.min()), float(known.max())
-    if quantity == "distance":
-        name, std = "distance_m", "distance_std_m"
-        extent = f"{low:.0f} to {high:.0f} {units.distance_name}. The table of tracks lists the nearest ones."
-        note = f"{units.distance_name.capitalize()} along the road; the band is one standard error"
-    else:
-        name, std, extent = "speed_mps", None, f"{low:.0f} to {high:.0f} {units.speed_symbol}."
-        note = (
-            f"{units.speed_name.capitalize()} relative to the camera, above 0 when moving away; standard "
-            f"error at most {units.speed * MAX_SPEED_STD:.0f} {units.speed_symbol}"
-        )
     # The band around a line belongs to it.
-    edges = [track.columns[name] + track.columns[std] for track in tracks] if std else []
+    edges = [track.columns[column] + track.columns[std] for track in tracks] if std else []
     top = max([high, *(float(np.nanmax(each)) for each in edges if np.isfinite(each).any())])
-    value_axis = ValueAxis.covering(min(low, 0.0), max(top, 0.0), 150)
-    curves = "".join(curve(track, name, axis, value_axis, std=std) for track in tracks)
-    ends = end_labels(tracks, name, axis, value_axis)
-    label = f"Lines: {quantity} of each track, from {extent}"
-    svg = chart(curves, axis, value_axis, label=label, names=ends)
+    values = ValueAxis.covering(min(low, 0.0), max(top, 0.0), 150)
+    curves = "".join(curve(track, column, axis, values, std=std) for track in tracks)
+    if own is not None:
+        paths = curve_paths(np.arange(len(own)), own, axis, values)
+        curves += svg_element("g", *paths, class_="curve own")
+    label = f"Lines: {quantity} of each track, from {low:.0f} to {high:.0f} {symbol}."
+    svg = chart(curves, axis, values, label=label, names=end_labels(tracks, column, axis, values))
     return Figure(quantity.capitalize(), note, svg)
 
 
-def _script_data(tracks: Sequence[TrackHistory], axis: TimeAxis) -> dict[str, Any]:
+def _script_data(tracks: Sequence[TrackHistory], axis: TimeAxis, own: Floats | None) -> dict[str, Any]:
     """Values that the script shows for each frame: numbers only."""
+
+    def means(frames: NDArray[np.int64], values: Floats) -> list[float | None]:
+        found = dict(zip(*bin_means(frames, values, axis.bin_width)))
+        numbers = range(int(frames[0]) // axis.bin_width, int(frames[-1]) // axis.bin_width + 1)
+        return [round(float(found[number]), 1) if number in found else None for number in numbers]
+
     listed = []
     for track in tracks:
-        first, last = track.first // axis.bin_width, track.last // axis.bin_width
-        points: dict[str, list[float | None]] = {}
-        for key, name in (("distance", "distance_m"), ("speed", "speed_mps")):
-            means = dict(zip(*bin_means(track.frames, track.columns[name], axis.bin_width)))
-            points[key] = [round(float(means[n]), 1) if n in means else None for n in range(first, last + 1)]
-        rough = track.columns["distance_std_m"] > ROUGH_DISTANCE * track.columns["distance_m"]
-        shares = dict(zip(*bin_means(track.frames, rough.astype(np.float64), axis.bin_width)))
-        points["rough"] = [int(shares.get(n, 0.0) > 0.5) for n in range(first, last + 1)]
-        values = {"id": track.id, "color": track.color, "spans": track.spans(), "first": first}
-        listed.append(values | points)
-    return {"fps": axis.fps, "frames": axis.frames, "step": axis.bin_width, "tracks": listed}
+        distances, stds = track.columns["distance_m"], track.columns["distance_std_m"]
+        rough = means(track.frames, (stds > ROUGH_DISTANCE * distances).astype(np.float64))
+        listed.append(
+            {
+                "id": track.id,
+                "color": track.color,
+                "spans": track.spans(),
+                "first": track.first // axis.bin_width,
+                "distance": means(track.frames, distances),
+                "speed": means(track.frames, track.columns["speed_mps"]),
+                "rough": [int((share or 0.0) > 0.5) for share in rough],
+            }
+        )
+    own_means = [] if own is None or not len(own) else means(np.arange(len(own)), own)
+    return {
+        "fps": axis.fps, "frames": axis.frames, "step": axis.bin_width, "tracks": listed, "own": own_means
+    }  # fmt: skip
 
 
 def _settings(detector: Any, shape: tuple[int, ...]) -> list[Group]:
@@ -321,24 +356,8 @@ def _settings(detector: Any, shape: tuple[int, ...]) -> list[Group]:
         if dataclasses.is_dataclass(params):
             names = (each.name for each in dataclasses.fields(params))
             values = {name: getattr(params, name) for name in names if name not in ("bands", "shape")}
-            found.append(Group(title, values, _band_table(bands) if bands and params is search else None))
+            found.append(Group(title, values))
     return found
-
-
-def _band_table(bands: Sequence[Any]) -> Table:
-    def number(value: float) -> str:
-        return format_value(float(round(value, 1)))
-
-    rows = []
-    for band in bands:
-        size = "\N{NO-BREAK SPACE}\N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}".join(map(number, band.window))
-        y, x = (" to ".join(map(number, each)) for each in (band.y, band.x))
-        rows.append([size, y, x, ", ".join(f"{fraction:.3g}" for fraction in band.overlap)])
-    note = (
-        "Pixels of a frame 1280 wide; rows count from the horizon, columns are fractions of the width, and "
-        "overlaps fractions of a window."
-    )
-    return Table("Search bands", note, ("Window", "Rows", "Columns", "Overlap"), rows)
 
 
 def _model_summary(model: Any) -> dict[str, Any] | None:
@@ -347,49 +366,7 @@ def _model_summary(model: Any) -> dict[str, Any] | None:
         return None
     title, facts = model.summary()
     metadata: Mapping[str, Any] = model.metadata
-    groups = [Group("Details", facts)]
-    for name, values in metadata.items():
-        shown = dict(values) if isinstance(values, Mapping) else {name: values}
-        if name == "metrics":
-            shown = {key: value for key, value in shown.items() if key not in ("splits", "left_out")}
-        groups.append(Group(name.capitalize(), shown))
-    tables = _score_tables(metadata)
-    return {
-        "title": title,
-        "license": _license(metadata),
-        "tables": [table for table in tables if table.rows],
-        "groups": [group for group in groups if group.values],
-    }
-
-
-def _score_tables(metadata: Mapping[str, Any]) -> list[Table]:
-    """Scores of a model by data set; a model file may hold anything, and other values are ignored."""
-
-    def scores_of(name: str) -> dict[str, Mapping[str, Any]]:
-        metrics = metadata.get("metrics")
-        scores = metrics.get(name) if isinstance(metrics, Mapping) else None
-        listed = scores.items() if isinstance(scores, Mapping) else ()
-        return {key: values for key, values in listed if isinstance(values, Mapping)}
-
-    def cell(value: object) -> str:
-        return f"{value:.3f}" if isinstance(value, (int, float)) else str(value)
-
-    titles, splits = split_table(scores_of("splits"))
-    note = "Accuracy on patches that were not used for training; vehicles in whole frames are another task."
-    columns = ("f1", "average_precision", "precision", "recall", "mean_iou")
-    left_out = [
-        [name, *(cell(values.get(key, "")) for key in columns)]
-        for name, values in scores_of("left_out").items()
-    ]
-    quality = "Single frames of sources that were left out of training, IoU 0.5."
-    return [
-        Table("Accuracy of the model", note, tuple(map(_heading, titles)), splits),
-        Table("Quality of the model", quality, ("Frames", *map(_heading, columns)), left_out),
-    ]
-
-
-def _heading(name: str) -> str:
-    return name.replace("_", " ").capitalize().replace("iou", "IoU")
+    return {"title": title, "license": _license(metadata), "groups": [Group("Details", facts)]}
 
 
 def _license(metadata: Mapping[str, Any]) -> str:

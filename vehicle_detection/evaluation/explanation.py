@@ -11,6 +11,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import cv2
@@ -34,6 +35,11 @@ _MIN_WINDOW_IOU = 0.2
 # are reduced to about this number of pixels, to save time.
 _OCCLUDED_CELLS, _CONTEXT, _SURROUNDINGS, _STRIDE = 6, 0.1, 64, 32
 _MAX_PIXELS = 90_000
+# Names of the ninths of a window, row by row.
+_PARTS = tuple(
+    "the center" if row == column == "middle" else f"the {row} {column}"
+    for row, column in product(("upper", "middle", "lower"), ("left", "middle", "right"))
+)
 # Lower scores than any of a network.
 _ANY_SCORE = -1e6
 
@@ -63,6 +69,21 @@ class Explanation:
     def margin(self) -> float:
         """Sum of the terms: decision value of a classifier; log-odds of a network above its threshold."""
         return float(sum(self.terms.values()))
+
+    def describe(self) -> str:
+        """Say in words what was found, and which ninths of the window speak most for and against it."""
+        across, down = (_overlap(3, count) for count in self.cells.shape[::-1])
+        parts = (down @ self.cells @ across.T).ravel()
+        order, largest = np.argsort(-parts), np.abs(parts).max()
+        ends = ((order[:2], "for it"), (order[:-3:-1], "against it"))
+        clauses = []
+        for (numbers, side), sign in zip(ends, (1, -1)):
+            named = [_PARTS[number] for number in numbers if sign * parts[number] > 0.25 * largest]
+            if named:
+                verb = "speaks" if len(named) == 1 else "speak"
+                clauses.append(f"{' and '.join(named)} {verb} {side}")
+        found = "No vehicle is found here" if self.score is None else "A vehicle is found here"
+        return f"{found}: {'; '.join(clauses)}." if clauses else f"{found}; no part stands out."
 
     def __str__(self) -> str:
         score = "not found" if self.score is None else f"score {self.score:.2f}"
