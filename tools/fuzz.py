@@ -26,13 +26,14 @@ import numpy as np
 
 import vehicle_detection as vd
 from tools import bad_input
+from tools.tool_files import tool_cases
 from vehicle_detection._common import write_model
 from vehicle_detection.errors import VehicleDetectionError
 
 MAX_MEMORY_GB = 4.0
 """Limit of the process's memory in a long run."""
 
-SHORT = {"images": 300, "labels": 300, "models": 150, "archives": 60, "videos": 12}
+SHORT = {"images": 300, "labels": 300, "models": 150, "archives": 60, "videos": 12, "tools": 300}
 """Number of inputs of each kind in the tests."""
 
 Case = tuple[str, Callable[[], object]]
@@ -238,6 +239,7 @@ KINDS: dict[str, Callable[[Path, random.Random], Iterator[Case]]] = {
     "models": model_cases,
     "archives": archive_cases,
     "videos": video_cases,
+    "tools": tool_cases,
 }
 """Source of the inputs of each kind."""
 

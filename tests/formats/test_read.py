@@ -220,7 +220,7 @@ def test_coco_file(tmp_path):
         ("a.txt", "1,1,2,3\n", "line 1: expected frame, id, x, y, width, height, found 4"),
         ("a.txt", "1,1,2,3,-4,5\n", "line 1: a box needs x1 < x2"),
         ("a.txt", "1,1,1e308,3,1.7e308,5\n", "line 1: x[12] must be a number of pixels"),
-        ("a.txt", "1,1,2,3,4,5,0.5\n1,2,2,3,4,5\n", "line 2: some boxes have a score and some have none"),
+        ("a.txt", "1,1,2,3,4,5,0.5\n1,2,2,3,4,5\n", "line 2: expected 7 values, as before, found 6"),
     ],
 )
 def test_invalid_files_of_other_formats(tmp_path, name, text, message):

@@ -110,6 +110,47 @@ def test_yolo_of_cvat(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("name", "text"),
+    [("a.txt", "1,1,9,9,30,40,0.9,0\n1,2,9,9,30,40,0.9,2"), ("labels/a.txt", "0 .5 .5 .2 .2\n9 .5 .5 .2 .2")],
+)
+def test_classes_that_are_numbers_are_read_with_a_warning(name, text, tmp_path, caplog):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    source = path if path.parent == tmp_path else path.parent
+    assert len(read_labels(source, shape=(100, 200))) == 2
+    assert "are read as vehicles" in caplog.text
+    caplog.clear()
+    assert len(read_labels(source, shape=(100, 200), classes=["0"])) == 1
+    assert not caplog.text
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.txt", "1,1,9,9,30,40,1,1,1.0\n1,2,9,9,30,40\n", "line 2: expected 9 values, as before, found 6"),
+        ("a.txt", "1,1,9,9,30,40,1,1,1.0\n1,2,9,9,30,40,1,1,x\n", "line 2: value must be a finite number"),
+        ("a.txt", "1,nan,9,9,30,40,0.5\n", "line 1: value must be a finite number"),
+        ("labels/a.txt", "0 .5 .5 .2 .2 .9 1\n0 .5 .5 .2 .2 .9", "line 2: expected 7 values, as before"),
+        ("labels/a.txt", "0 .5 .5 .2 .2 1\n", "tracks without confidences"),
+    ],
+)
+def test_rows_that_are_cut_off_or_damaged(name, text, message, tmp_path):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    with pytest.raises(DatasetError, match=message):
+        read_labels(path if path.parent == tmp_path else path.parent, shape=(100, 200))
+
+
+def test_a_class_without_a_name_is_an_error(tmp_path):
+    (tmp_path / "classes.txt").write_text("car\nbus")
+    (tmp_path / "a.txt").write_text("2 .5 .5 .2 .2")
+    with pytest.raises(DatasetError, match="line 1: class 2 has no name"):
+        read_labels(tmp_path, format="yolo", shape=(100, 200))
+
+
+@pytest.mark.parametrize(
     ("name", "text", "message"),
     [
         ("a.json", {"shapes": [], "imagePath": "a.jpg"}, "Labelme or X-AnyLabeling, .* export COCO"),

@@ -74,6 +74,8 @@ def evaluate(
     if all(np.isfinite(boxes["distance_m"]).any() for boxes in (found, true)):
         scores["distances"] = evaluate_distances(found, true, iou=iou, frames=chosen)
     print_line("\n\n".join(each.summary() for each in scores.values()))
+    if scored:
+        print_error(f"note: {labels} has scores, as results do; its boxes are taken for true ones")
     _note_frames_of_one_file(found, true, chosen, predictions, labels)
     for boxes, count, file in zip((found, true), unknown, (predictions, labels)):
         if 0 < count < (~boxes["ignore"]).sum():

@@ -40,6 +40,7 @@ from vehicle_detection.formats.rows import (
     read_lines,
     read_text,
     rows_of_records,
+    warn_of_numbers,
 )
 from vehicle_detection.formats.yolo import read_yolo
 from vehicle_detection.tables import (
@@ -163,7 +164,7 @@ def _read_kitti(source: Path, classes: Collection[str] | None) -> FileRows:
             if tracked and len(files) > 1:
                 raise DatasetError(f"{source} holds tracks of several drives; name one of its files")
             if tracked:
-                place = {"frame": int(words[0]), "track_id": words[1]}
+                place = {"frame": int(words[0]), "track_id": parse_number(words[1], "track", where)}
             record = _kitti_record(where, words[2:] if tracked else words, classes)
             if record is not None:
                 # `ignore` with NO_TRACK means a region, so an ignored vehicle gets a track number of its own.
@@ -199,8 +200,10 @@ def _kitti_record(where: str, words: list[str], classes: Collection[str] | None)
 
 def _read_mot(source: Path, classes: Collection[str] | None) -> FileRows:
     rows = list(_mot_rows(read_lines(source)))
-    if classes is not None and rows:
-        found = {number for *_, number in rows if number is not None}
+    found = {number for *_, number in rows if number is not None}
+    if classes is None:
+        warn_of_numbers(source, found, "pass the numbers of vehicles as classes=")
+    elif rows:
         if not found:
             raise DatasetError(f"{source} holds predictions, which have no classes; leave out classes=")
         check_classes(source, found, classes)
@@ -216,6 +219,8 @@ def _mot_rows(
     rows = [(where, _split_words(line.rstrip(","))) for where, line in lines]
     labelled = all(_is_mot_label(words) for _, words in rows)
     for where, words in rows:
+        if len(words) != len(rows[0][1]):  # it may be cut off, and then labels would look like results
+            raise DatasetError(f"{where}: expected {len(rows[0][1])} values, as before, found {len(words)}")
         if len(words) < 6:
             raise DatasetError(f"{where}: expected frame, id, x, y, width, height, found {len(words)} values")
         frame = parse_number(words[0], "frame (counted from 1)", where)
@@ -224,13 +229,14 @@ def _mot_rows(
                 f"{where}: frame (counted from 1) must be at least 1, got {describe(words[0])}"
             )
         x, y, width, height = (parse_number(word, "side of the box", where) for word in words[2:6])
+        track, *values = (parse_number(word, "value", where) for word in (words[1], *words[6:]))
         x, y = x - first_pixel, y - first_pixel
-        record: Record = {"frame": int(frame) - 1, "track_id": words[1]}
+        record: Record = {"frame": int(frame) - 1, "track_id": track}
         record |= zip(CORNERS, (x, y, x + width, y + height))
         if labelled:
-            record["ignore"] = float(words[6]) == 0
+            record["ignore"] = values[0] == 0
         else:
-            record["score"] = words[6] if len(words) > 6 else None
+            record["score"] = values[0] if values else None
         yield where, record, words[7] if len(words) in (8, 9) and words[7] != "-1" else None
 
 

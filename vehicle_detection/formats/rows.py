@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
-from vehicle_detection._common import Limit, read_regular_file
+from vehicle_detection._common import Limit, read_regular_file, shorten
 from vehicle_detection.datasets import is_image
 from vehicle_detection.errors import DatasetError
-from vehicle_detection.tables import BOX_COLUMNS, FrameKey
+from vehicle_detection.tables import BOX_COLUMNS, FrameKey, frame_order
+
+_LOGGER = logging.getLogger(__name__)
 
 Record = dict[str, Any]
 """Values of a row by the names of their columns, None where a value is unknown."""
@@ -53,6 +56,13 @@ def without_suffix(name: str) -> str:
     """Return the name of a frame without the suffix of an image."""
     path = PurePosixPath(name)
     return name[: -len(path.suffix)] if is_image(path.name) else name
+
+
+def warn_of_numbers(source: Path, numbers: Collection[str], remedy: str) -> None:
+    """Warn that the boxes of several classes without names are read, of which some may not be vehicles."""
+    if len(numbers) > 1:
+        listed = ", ".join(sorted(numbers, key=frame_order))
+        _LOGGER.warning("%s: all classes (%s) are read as vehicles; %s", source, shorten(listed), remedy)
 
 
 def no_text_files(folder: Path, expected: str) -> DatasetError:

@@ -20,6 +20,7 @@ from vehicle_detection.formats.rows import (
     read_lines,
     read_text,
     rows_of_records,
+    warn_of_numbers,
     without_suffix,
 )
 from vehicle_detection.images import image_size, read_image
@@ -34,6 +35,7 @@ from vehicle_detection.tables import (
 
 # Confidences of 0 and 1 have infinite log-odds.
 _MIN_CONFIDENCE = 1e-6
+_TRACKS_ALONE = "tracks without confidences; write those too (save_conf=True of Ultralytics)"
 
 
 def read_yolo(source: Path, classes: Collection[str] | None, shape: Any, images: FrameSet | None) -> FileRows:
@@ -58,16 +60,28 @@ def read_yolo(source: Path, classes: Collection[str] | None, shape: Any, images:
     files.sort(key=lambda file: frame_order(file.name))
     frames = _yolo_frames(files, shape) if images is None else _yolo_images(files, images)
     rows: list[tuple[str, Record]] = []
-    numbers: set[str] = set()
+    numbers, sixth = set[str](), set[str]()
     for file, (key, size) in zip(files, frames, strict=True):
-        for where, line in read_lines(file):
-            name, record = _yolo_record(where, line.split(), size)
+        lines = [(where, line.split()) for where, line in read_lines(file)]
+        for where, words in lines:
+            if len(words) != len(lines[0][1]):
+                raise DatasetError(
+                    f"{where}: expected {len(lines[0][1])} values, as before, found {len(words)}"
+                )
+            name, record = _yolo_record(where, words, size)
+            if names and name not in names:
+                raise DatasetError(f"{where}: class {words[0]} has no name; add it to the list of names")
             # Without names, classes are numbers, and by default all of them are vehicles.
             numbers.add(name)
+            sixth.update(words[5:6] if len(words) == 6 else ("",))
             if (not names and classes is None) or names.get(name, name) in wanted:
                 rows.append((where, {"frame": key, **record}))
+    if sixth and sixth <= {"0", "1"}:
+        raise DatasetError(f"{source} has {_TRACKS_ALONE}")
     if not names and classes is not None and numbers:
         check_classes(source, numbers, wanted)
+    elif not names:
+        warn_of_numbers(source, numbers, "add classes.txt with their names, or pass classes=")
     return rows_of_records(rows, [key for key, _ in frames])
 
 
@@ -113,11 +127,11 @@ def _yolo_record(where: str, words: list[str], shape: tuple[int, ...]) -> tuple[
         confidence = parse_number(words[5], "confidence", where)
         if not 0 <= confidence <= 1:
             raise DatasetError(
-                f"{where}: confidence must be from 0 to 1, got {describe(words[5])}; if that is a track, "
-                "write confidences too (save_conf=True of Ultralytics)"
+                f"{where}: confidence must be from 0 to 1, got {describe(words[5])}; it may be one of "
+                f"{_TRACKS_ALONE}"
             )
         record["score"] = logit(min(max(confidence, _MIN_CONFIDENCE), 1 - _MIN_CONFIDENCE))
-        record["track_id"] = words[6] if len(words) > 6 else None
+        record["track_id"] = parse_number(words[6], "track", where) if len(words) > 6 else None
     name = words[0].partition(".")[0] if FRAME_NUMBER.fullmatch(words[0]) else words[0]
     return name, record
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Floats, atomic_write, check_number, resolve_jobs
+from vehicle_detection._common import Floats, atomic_write, check_number, resolve_jobs, spreadsheet_text
 from vehicle_detection.boxes import Platt
 from vehicle_detection.evaluation import (
     DetectionMatches,
@@ -292,4 +292,5 @@ def write_curves(path: str | os.PathLike[str], folds: Sequence[FoldDetections]) 
         writer.writerow(["frames", "logit", "precision", "recall"])
         for fold in folds:
             for precision, recall, logit in zip(*precision_recall_curve(fold.predictions, fold.labels)):
-                writer.writerow([fold.frames.name, f"{logit:.4f}", f"{precision:.4f}", f"{recall:.4f}"])
+                name = spreadsheet_text(fold.frames.name)
+                writer.writerow([name, f"{logit:.4f}", f"{precision:.4f}", f"{recall:.4f}"])

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import Limit, hide_credentials
 from vehicle_detection.errors import TransientVideoError, VideoError
+from vehicle_detection.video.web import NETWORK_DEADLINE, NETWORK_TIMEOUT, REFUSED, web_proxy
 
 _PIPE_BYTES = 1 << 18
 # Signals by which ffmpeg ends itself, because of the file.
@@ -43,10 +44,6 @@ _SYSTEM_FAULT = re.compile(r"^.*(Resource temporarily unavailable|Too many open 
 # Lines that follow the messages about errors.
 _STATISTICS = re.compile(r"Conversion failed!|frame= |video:")
 _NO_MEMORY = "Cannot allocate memory"
-NETWORK_TIMEOUT = 10.0
-"""Seconds without data after which a server has failed."""
-NETWORK_DEADLINE = 60.0
-"""Seconds after which a server has failed that sends too little for a frame, or for the start of a video."""
 
 
 # Formats that hold a video or a sound. Others, such as lists and manifests, name further files to read.
@@ -76,9 +73,11 @@ def input_options(path: Path | str) -> tuple[str, ...]:
 
 def network_options(url: str) -> tuple[str, ...]:
     """Return the options of ffmpeg that open a URL, which may be that of a playlist at an HTTP server."""
-    playlists = url.lower().startswith(("http://", "https://"))
-    formats = ",hls,dash" if playlists else ",rtsp,rtp"
-    return (*restrict_input(_NETWORK + ",data" * playlists, formats), "-i", url)
+    if not url.lower().startswith(("http://", "https://")):
+        return (*restrict_input(_NETWORK, ",rtsp,rtp"), "-i", url)
+    proxy = web_proxy(url)
+    options = restrict_input(f"{_NETWORK},data", ",hls,dash")
+    return (*options, *(("-http_proxy", proxy) if proxy else ()), "-i", url)
 
 
 def source_name(path: Path | str) -> str:
@@ -227,6 +226,9 @@ class Process:
         if sys.platform == "win32":
             group = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
         nostdin = ["-nostdin"] if stdin == subprocess.DEVNULL else []
+        if "-http_proxy" in options:  # also for hosts in no_proxy, and for what a playlist names
+            kept = {name: value for name, value in os.environ.items() if name.lower() != "no_proxy"}
+            group["env"] = kept | {"http_proxy": options[options.index("-http_proxy") + 1]}
         self.cpu_seconds = 0.0
         """Processor time, known after the process has ended, on systems that report it."""
         self._lock = threading.Lock()
@@ -376,7 +378,9 @@ def video_error(message: str, source: Path | str, code: int, log: str) -> VideoE
 
 
 def last_line(log: str) -> str:
-    """Last message of ffmpeg's log, without the prefix ``[component @ address]``."""
+    """Last message of ffmpeg's log, without the prefix ``[component @ address]``; or that of `web_proxy`."""
+    if refused := re.search(rf"HTTP error (?:{REFUSED}|502) (.+)", log):
+        return refused[1]
     lines = [re.sub(r"^(\[[^\]]*\] *)+", "", line).strip() for line in log.splitlines()]
     return next((line for line in reversed(lines) if line and not _STATISTICS.match(line)), "no reason given")
 

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video.ffmpeg import (
-    NETWORK_TIMEOUT,
     SQUARE_PIXELS,
     Process,
     check_frame_size,
@@ -30,6 +29,7 @@ from vehicle_detection.video.ffmpeg import (
 from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.queues import ClosableQueue, QueueClosed
 from vehicle_detection.video.reading import Reader
+from vehicle_detection.video.web import NETWORK_TIMEOUT
 from vehicle_detection.video.yuv import ColorEncoding, rgb_from_planes
 
 _LOGGER = logging.getLogger(__name__)

@@ -24,7 +24,6 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.ffmpeg import (
-    NETWORK_TIMEOUT,
     input_options,
     network_options,
     restrict_input,
@@ -45,6 +44,7 @@ from vehicle_detection.video.sources import (
     VideoSegments,
     exact_rate,
 )
+from vehicle_detection.video.web import NETWORK_TIMEOUT
 
 _LOGGER = logging.getLogger(__name__)
 

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from vehicle_detection._common import Closing, check_number, pluralize
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.video.ffmpeg import (
-    NETWORK_DEADLINE,
     Process,
     check_resources,
     exit_reason,
@@ -35,6 +34,7 @@ from vehicle_detection.video.ffmpeg import (
     video_error,
 )
 from vehicle_detection.video.probe import VideoInfo
+from vehicle_detection.video.web import NETWORK_DEADLINE
 from vehicle_detection.video.yuv import FORMATS, rgb_from_planes
 
 _LOGGER = logging.getLogger(__name__)

@@ -12,14 +12,13 @@ from urllib.parse import unquote
 
 from vehicle_detection._common import hide_credentials
 from vehicle_detection.errors import InvalidInputError, TransientVideoError
-from vehicle_detection.video.ffmpeg import NETWORK_DEADLINE, NETWORK_TIMEOUT
+from vehicle_detection.video.web import MIN_RATE, NETWORK_DEADLINE, NETWORK_TIMEOUT, REFUSED, web_proxy
 
 Result = TypeVar("Result")
 
 # Seconds before the second and the third attempt of a request.
 _RETRY_DELAYS = (0.2, 1.0)
 _CHUNK_BYTES = 1 << 20
-_MIN_RATE = 1000  # bytes per second below which a server has failed
 # Maximum length of a file name, in characters that may take four bytes each.
 _MAX_NAME = 60
 _FINAL_ERRORS = (FileNotFoundError, PermissionError, NotImplementedError, TypeError, AttributeError)
@@ -60,7 +59,11 @@ def file_name(url: str) -> str:
 def _download_http(url: str, path: Path) -> None:
     import requests
 
-    with requests.get(url, stream=True, timeout=NETWORK_TIMEOUT) as answer:
+    proxy = web_proxy(url)
+    proxies = {"http": proxy, "https": proxy} if proxy else None
+    with requests.get(url, stream=True, timeout=NETWORK_TIMEOUT, proxies=proxies) as answer:
+        if answer.status_code == REFUSED and proxy:
+            raise PermissionError(answer.reason)
         if answer.status_code in (404, 410):
             raise FileNotFoundError(url)
         answer.raise_for_status()
@@ -70,7 +73,7 @@ def _download_http(url: str, path: Path) -> None:
             while data := read(_CHUNK_BYTES, decode_content=True):
                 size += file.write(data)
                 elapsed = time.monotonic() - begun
-                if elapsed > NETWORK_DEADLINE and size < _MIN_RATE * elapsed:
+                if elapsed > NETWORK_DEADLINE and size < MIN_RATE * elapsed:
                     raise TimeoutError(f"only {size} bytes in {elapsed:.0f} s")
 
 

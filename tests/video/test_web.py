@@ -1,0 +1,153 @@
+"""What web servers may refer to, and how long they may take."""
+
+import contextlib
+import http.server
+import threading
+import time
+
+import pytest
+
+from tests.video.clips import gray_frames, write_clip
+from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
+from vehicle_detection.video import ffmpeg as ffmpeg_module
+from vehicle_detection.video import open_source, remote, web
+
+DASH = """<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011" type="static"
+    mediaPresentationDuration="PT1S"><Period><AdaptationSet mimeType="video/mp4"><Representation id="1"
+    bandwidth="1"><BaseURL>{}</BaseURL></Representation></AdaptationSet></Period></MPD>"""
+HLS = "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:0.2,\n{}\n#EXT-X-ENDLIST\n"
+
+
+@contextlib.contextmanager
+def server(answer):
+    """Serve requests on the loopback interface; `answer` returns status, headers and body for a path."""
+    paths = []
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            paths.append(self.path)
+            status, headers, body = answer(self.path)
+            self.send_response(status)
+            for name, value in {"Content-Length": len(body), **headers}.items():
+                self.send_header(name, str(value))
+            with contextlib.suppress(ConnectionError):
+                self.end_headers()
+                self.wfile.write(body)
+
+        def log_message(self, *_):
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as running:
+        threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.02}).start()
+        try:
+            yield f"http://127.0.0.1:{running.server_address[1]}", paths
+        finally:
+            running.shutdown()
+
+
+@pytest.fixture(scope="module")
+def data(folder):
+    return write_clip(folder / "web.ts", gray_frames(5)).read_bytes()
+
+
+def refer(kind, target, data):
+    """Answer with the video, or at the path /first.m3u8 with a reference to it at another address."""
+
+    def answer(path):
+        if path != "/first.m3u8":
+            return 200, {}, data
+        if kind == "redirect":
+            return 302, {"Location": target()}, b""
+        return 200, {}, {"HLS": HLS, "DASH": DASH}[kind].format(target()).encode()
+
+    return answer
+
+
+@pytest.mark.parametrize(
+    ("kind", "allowed"),
+    [("redirect", False), ("HLS", False), ("DASH", False), ("redirect", True), ("HLS", True)],
+)
+def test_references_to_other_private_servers_are_refused(kind, allowed, data, monkeypatch):
+    monkeypatch.setenv("no_proxy", "127.0.0.1,localhost")
+    if allowed:
+        monkeypatch.setenv(web.ALLOW_PRIVATE, "1")
+    with (
+        server(lambda _: (200, {}, data)) as (other, asked),
+        server(refer(kind, lambda: f"{other}/a.ts", data)) as (address, _),
+    ):
+        if allowed:
+            with open_source(f"{address}/first.m3u8", live=False, reconnect=False) as source:
+                assert source.info.shape == (48, 64, 3)
+            assert asked
+        else:
+            with pytest.raises(VideoError, match=rf"private address|{address}"):
+                open_source(f"{address}/first.m3u8", reconnect=False)
+            assert not asked
+
+
+@pytest.mark.parametrize("kind", ["redirect", "HLS"])
+def test_references_to_the_same_server_are_followed(kind, data):
+    with (
+        server(refer(kind, lambda: "/a.ts", data)) as (address, paths),
+        open_source(f"{address}/first.m3u8", live=False, reconnect=False) as source,
+    ):
+        assert source.info.shape == (48, 64, 3)
+    assert "/a.ts" in paths
+
+
+def test_copies_of_redirected_files(data, tmp_path):
+    with (
+        server(lambda _: (200, {}, data)) as (other, asked),
+        server(refer("redirect", lambda: f"{other}/a.ts", data)) as (address, _),
+    ):
+        with pytest.raises(InvalidInputError, match="private address"):
+            remote.download(f"{address}/first.m3u8", tmp_path)
+        assert not asked
+        assert remote.download(f"{address}/a.ts", tmp_path).read_bytes() == data
+
+
+@pytest.mark.parametrize(
+    ("address", "public"),
+    [
+        ("8.8.8.8", True),
+        ("2606:4700:4700::1111", True),
+        ("127.0.0.1", False),
+        ("10.1.2.3", False),
+        ("169.254.169.254", False),  # metadata of cloud machines
+        ("100.64.0.1", False),
+        ("224.0.0.1", False),
+        ("0.0.0.0", False),
+        ("::1", False),
+        ("fe80::1%eth0", False),
+        ("fd00::1", False),
+        ("::ffff:127.0.0.1", False),
+    ],
+)
+def test_public_addresses(address, public):
+    assert web._is_public(address) == public
+
+
+def test_a_proxy_of_the_user_decides_itself(monkeypatch):
+    assert web.web_proxy("https://example.org/a.mp4").startswith("http://127.0.0.1:")
+    monkeypatch.setenv("HTTPS_PROXY", "http://proxy.example:3128")
+    assert web.web_proxy("https://example.org/a.mp4") is None
+
+
+def test_headers_that_drip_end_at_a_deadline(tmp_path, monkeypatch):
+    def send_slowly(handler, name, value):
+        with contextlib.suppress(ConnectionError):
+            handler.wfile.write(f"{name}: {value}\r\n".encode())
+        time.sleep(0.2)
+
+    for module in (web, ffmpeg_module, remote):
+        monkeypatch.setattr(module, "NETWORK_DEADLINE", 1.0)
+    monkeypatch.setattr(remote, "_RETRY_DELAYS", ())
+    monkeypatch.setattr(http.server.BaseHTTPRequestHandler, "send_header", send_slowly)
+    headers = {f"X-{n}": n for n in range(100)}
+    with server(lambda _: (200, headers, b"")) as (address, _):
+        begun = time.monotonic()
+        with pytest.raises(TransientVideoError):
+            remote.download(f"{address}/a.mp4", tmp_path)
+        with pytest.raises(VideoError):
+            open_source(f"{address}/a.mp4", reconnect=False)
+        assert time.monotonic() - begun < 15
