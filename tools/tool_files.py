@@ -1,7 +1,7 @@
 """Write label and result files as the annotation and tracking tools of today do, from a known truth.
 
-`tool_cases` feeds them to `read_labels`, whole and damaged: a whole file must give the truth, a damaged one the
-truth or an error of the library. Formats that are not read must be named in the error.
+`tool_cases` feeds them to `read_labels`, whole and damaged: a whole file must give the truth, a damaged one
+the truth or an error of the library. Formats that are not read must be named in the error.
 """
 
 from __future__ import annotations

@@ -132,8 +132,9 @@ def _yolo_record(where: str, words: list[str], shape: tuple[int, ...]) -> tuple[
             )
         record["score"] = logit(min(max(confidence, _MIN_CONFIDENCE), 1 - _MIN_CONFIDENCE))
         record["track_id"] = parse_number(words[6], "track", where) if len(words) > 6 else None
-    name = words[0].partition(".")[0] if FRAME_NUMBER.fullmatch(words[0]) else words[0]
-    return name, record
+    if not FRAME_NUMBER.fullmatch(words[0]):
+        raise DatasetError(f"{where}: class must be a whole number, got {describe(words[0])}")
+    return words[0].partition(".")[0], record
 
 
 def _yolo_names(source: Path) -> dict[str, str]:

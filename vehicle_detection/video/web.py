@@ -15,7 +15,6 @@ import socket
 import socketserver
 import threading
 import time
-from typing import Any
 from urllib.parse import urlsplit
 
 from vehicle_detection.errors import InvalidInputError
@@ -64,31 +63,35 @@ class _Proxy(socketserver.ThreadingTCPServer):
 
     def connect(self, host: str, port: int) -> socket.socket:
         """Connect to a server; a PermissionError if its address is neither public nor that of the URL."""
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-        allowed = [each for each in found if _is_public(each[4][0])] or self._named(found, port)
+        found = _addresses(host)
+        allowed = [address for address in found if _is_public(address)] or self._named(found, port)
         if not allowed:
             raise PermissionError(
                 f"the server refers to {host} port {port}, a private address; open that, or set "
                 f"{ALLOW_PRIVATE}=1"
             )
-        for each in allowed[:-1]:  # localhost may be ::1, which is not that of every server
+        for address in allowed[:-1]:  # localhost may be ::1, which is not that of every server
             with contextlib.suppress(OSError):
-                return socket.create_connection(each[4][:2], NETWORK_TIMEOUT)
-        return socket.create_connection(allowed[-1][4][:2], NETWORK_TIMEOUT)
+                return socket.create_connection((address, port), NETWORK_TIMEOUT)
+        return socket.create_connection((allowed[-1], port), NETWORK_TIMEOUT)
 
-    def _named(self, found: list[Any], port: int) -> list[Any]:
+    def _named(self, found: list[str], port: int) -> list[str]:
         """Return the addresses of the server that the URL names, which may redirect to HTTPS."""
         host, named = self.server_named
         if port != named and (named, port) != (80, 443):
             return []
-        known = {each[4][0] for each in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)}
-        return [each for each in found if each[4][0] in known]
+        known = _addresses(host)
+        return [address for address in found if address in known]
 
 
-def _is_public(address: str | int) -> bool:
+def _addresses(host: str) -> list[str]:
+    return [str(found[4][0]) for found in socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)]
+
+
+def _is_public(address: str) -> bool:
     import ipaddress
 
-    parsed = ipaddress.ip_address(str(address).partition("%")[0])
+    parsed = ipaddress.ip_address(address.partition("%")[0])
     inner = getattr(parsed, "ipv4_mapped", None) or parsed
     return inner.is_global and not inner.is_multicast
 
