@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from benchmarks._material import Context, classifier_for_search, searched_frame
 from benchmarks._report import Row
 from benchmarks._timing import median_of, median_seconds, seconds_of
-from vehicle_detection import SearchParams, VehicleClassifier, load_classifier, search
+from vehicle_detection import SearchParams, VehicleClassifier, _kernels, load_classifier, search
 from vehicle_detection._common import available_cores
-from vehicle_detection._kernels import Filter
 from vehicle_detection.search import SearchBand
 
 SIZES = ((640, 360), (960, 540), (1280, 720), (1600, 900), (1920, 1080))
@@ -161,8 +160,8 @@ def _timed_stages(stopwatch: _Stopwatch) -> Iterator[None]:
             put(name, _TimedModule(getattr(search, name), stopwatch, functions, everything=False))
         for name, stage in _FUNCTIONS.items():
             put(name, stopwatch.wrap(stage, getattr(search, name)))
-        timed = stopwatch.wrap("correlation", Filter.add_to)
-        stack.enter_context(mock.patch.object(Filter, "add_to", timed))
+        timed = stopwatch.wrap("correlation", _kernels.Filter.add_to)
+        stack.enter_context(mock.patch.object(_kernels.Filter, "add_to", timed))
         yield
 
 

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection import _kernels as kernels
 from vehicle_detection._common import (
     Checked,
     check_bool,
@@ -35,7 +36,6 @@ from vehicle_detection._common import (
     progress_bar,
     resolve_jobs,
 )
-from vehicle_detection._kernels import features as kernels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image
 

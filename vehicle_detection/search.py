@@ -29,6 +29,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection import _kernels as kernels
 from vehicle_detection._common import (
     NEW_ARRAYS,
     Checked,
@@ -44,8 +45,6 @@ from vehicle_detection._common import (
     number,
     single_threaded_opencv,
 )
-from vehicle_detection._kernels import Filter
-from vehicle_detection._kernels import features as kernels
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE, FeatureParams, convert_color, hog_source
@@ -447,7 +446,7 @@ class BandFilters:
         self.weights_by_bin = by_bin = by_bin.reshape(len(functions), 3, -1)
         self.tables = by_bin[:, :, self.bins] if self.hist_lookup else None
 
-    def _build_filters(self, weights: NDArray[np.float64]) -> list[Filter]:
+    def _build_filters(self, weights: NDArray[np.float64]) -> list[kernels.Filter]:
         """Build the filters of one template: over HOG, over coarse HOG, over spatial bins and histogram."""
         params, cells, bins = self.params, self.cells_per_window, self.bins_per_cell
         filters = []
@@ -462,7 +461,9 @@ class BandFilters:
                     # (channel, block row, block column, values in the block) to
                     # (block row, block column, channel and values), the order of `_hog_maps`.
                     blocks = part.reshape(params.hog_channels, positions, positions, -1).transpose(1, 2, 0, 3)
-                    filters.append(Filter(blocks.reshape(positions, positions, -1), dilation=dilation))
+                    filters.append(
+                        kernels.Filter(blocks.reshape(positions, positions, -1), dilation=dilation)
+                    )
         values = []
         if params.spatial_feat:
             planes = params.spatial_planes(weights[: params.spatial_length])
@@ -472,7 +473,7 @@ class BandFilters:
             values.append(part.transpose(1, 3, 0, 2, 4).reshape(cells, cells, -1))
         if self.hist_lookup:
             values.append(np.ones((cells, cells, 1)))
-        return [*filters, Filter(np.concatenate(values, axis=2))] if values else filters
+        return [*filters, kernels.Filter(np.concatenate(values, axis=2))] if values else filters
 
     def score_map(self, band: NDArray[np.uint8], workspace: Workspace) -> NDArray[np.float32]:
         """Scores of all windows of a resized band as a new ``(rows, columns)`` float32 array."""

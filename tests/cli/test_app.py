@@ -32,10 +32,32 @@ def test_help_has_a_short_option():
         assert "Show this message and exit" in succeed(*words, "-h")
 
 
+HEAVY = {"numba", "scipy", "sklearn", "skimage", "pandas", "matplotlib", "moviepy", "jinja2", "pooch"}
+
+
+@pytest.mark.parametrize(
+    ("words", "heavy"),
+    [
+        (["--help"], HEAVY | {"rich", "numpy", "cv2", "onnxruntime"}),
+        (["video", "--help"], HEAVY | {"rich", "numpy", "cv2", "onnxruntime"}),
+        (["info"], HEAVY),
+        (["detect", "road.png", "--output", "found"], HEAVY | {"rich"}),
+        (["video", "clip.mp4", "--output", "found.mp4", "--tracks", "found.csv"], HEAVY | {"rich"}),
+    ],
+)
+def test_a_command_imports_only_what_it_needs(material, tmp_path, words, heavy):
+    words = [material / word if (material / word).is_file() else word for word in words]
+    words = [tmp_path / word if str(word).startswith("found") else word for word in words]
+    code = "import atexit, sys; atexit.register(lambda: print(*sys.modules, file=sys.stderr))"
+    exit_code, _, errors = finish(start_changed(code, *words))
+    assert exit_code == 0, errors
+    assert not {name.split(".")[0] for name in errors.split()} & heavy
+
+
 def test_options_are_listed_in_panels():
     page = succeed("video", "--help")
-    titles = re.findall(r"^╭─ (\w+) ─", page, re.MULTILINE)
-    assert titles == ["Arguments", "Options", "Output", "Input", "Camera", "Search", "Drawing"]
+    titles = re.findall(r"^(\w+):$", page, re.MULTILINE)
+    assert titles == ["Arguments", "Output", "Input", "Camera", "Search", "Drawing", "Options"]
     assert re.search(r"--live\s+Drop frames", page), "an option without a value has no type"
 
 

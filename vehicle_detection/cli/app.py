@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import typer
 from typer import Option
-from typer.core import TyperArgument, TyperGroup
+from typer.core import TyperArgument, TyperCommand, TyperGroup
 
 from vehicle_detection import __version__
 from vehicle_detection.cli.batch import batch
@@ -98,6 +98,23 @@ def _print_system_errors() -> Iterator[None]:
     raise typer.Exit(BAD_INPUT)
 
 
+class _Command(TyperCommand):
+    """A command whose help lists the options of each panel under its name."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        panels: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):
+            if (record := param.get_help_record(ctx)) is None:
+                continue
+            if isinstance(param, TyperArgument):  # without its type
+                panels.setdefault("Arguments", []).append((str(param.metavar), record[1]))
+            else:
+                panels.setdefault(getattr(param, "rich_help_panel", None) or "Options", []).append(record)
+        for title, records in panels.items():
+            with formatter.section(title):
+                formatter.write_dl(records)
+
+
 class _Commands(TyperGroup):
     """Commands whose expected errors become one line on standard error."""
 
@@ -137,7 +154,8 @@ app = typer.Typer(
     help="Detect and track vehicles in dash-cam images and video.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    rich_markup_mode=None,  # rich takes longer to import than the help to print
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
 )
 
 
@@ -157,4 +175,4 @@ def _global_options(
 
 
 for _command in (demo, detect, video, evaluate, batch, train, train_frames, tune, fetch, info):
-    app.command()(_command)
+    app.command(cls=_Command)(_command)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection import _kernels as kernels
 from vehicle_detection import features as library
 from vehicle_detection._common import (
     Checked,
@@ -27,7 +28,6 @@ from vehicle_detection._common import (
     integer,
     is_listing,
 )
-from vehicle_detection._kernels import features as kernels
 from vehicle_detection.course.versions import (
     CHANNEL_ORDERS,
     READERS,

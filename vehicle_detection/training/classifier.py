@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import vehicle_detection
+from vehicle_detection import _kernels as kernels
 from vehicle_detection._common import (
     Checked,
     blur_patches,
@@ -22,7 +23,6 @@ from vehicle_detection._common import (
     mirror_patches,
     number,
 )
-from vehicle_detection._kernels import fit_svm
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, extract_features, read_patches
@@ -178,7 +178,9 @@ def fit_features(
     training, seed = options.to_dict(), options.random_state
     if estimator is None:
         costs = options.C * all_weights
-        fitted = fit_svm(features, all_labels, costs, rows=all_rows, gains=params.gains, random_state=seed)
+        fitted = kernels.fit_svm(
+            features, all_labels, costs, rows=all_rows, gains=params.gains, random_state=seed
+        )
         template, learner = Template(*fitted), "numba"
     else:
         training |= {"estimator": " ".join(repr(estimator).split()), "C": None, "solver": None}

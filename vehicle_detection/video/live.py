@@ -147,7 +147,6 @@ class LiveStream(Reader):
         self._opened = self._last_read = time.monotonic()
         height, width = self.info.shape[:2]
         self._planes_shape = (height * 3 // 2, width)
-        self._channels = np.empty((3, height, width), np.uint8)
         self._newest: ClosableQueue[tuple[int, NDArray[np.uint8]]] = ClosableQueue(1)
         self._thread: threading.Thread | None = None
 
@@ -175,7 +174,7 @@ class LiveStream(Reader):
                 raise
             start = float(self._first / self.info.fps)
             raise VideoError(f"{self.name} has no frame after {start:g} s ({self._reason()})") from None
-        frame = rgb_from_planes(planes, ColorEncoding(), self._channels)
+        frame = rgb_from_planes(planes, ColorEncoding())
         return number, float(number / self.info.fps), frame
 
     def _read_range(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:

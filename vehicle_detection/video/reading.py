@@ -131,7 +131,6 @@ class FrameReader(Reader):
         self._in_planes = info.pixel_format in FORMATS and info.color_encoding.supported and even
         pixel_format = info.pixel_format if self._in_planes else "rgb24"
         self._buffer = np.empty((height * 3 // 2, width) if self._in_planes else info.shape, np.uint8)
-        self._channels = np.empty((3, height, width), np.uint8)
         options += ["-pix_fmt", pixel_format, "-f", "rawvideo", "pipe:1"]
         self._process = Process(options, stdout=True)
 
@@ -142,7 +141,7 @@ class FrameReader(Reader):
             self._finish()
             raise StopIteration
         if self._in_planes:
-            frame = rgb_from_planes(self._buffer, self.info.color_encoding, self._channels)
+            frame = rgb_from_planes(self._buffer, self.info.color_encoding)
         else:
             frame = self._buffer.copy()
         index = self._first + self.frames_read

@@ -72,7 +72,6 @@ class FrameWriter(Closing):
         self._fps = info.fps
         width, height = info.width + info.width % 2, info.height + info.height % 2
         self._planes = np.empty((height * 3 // 2, width), np.uint8)
-        self._channels = np.empty((3, height, width), np.uint8)
         video = ["-f", "rawvideo", "-pixel_format", "yuv420p", "-video_size", f"{width}x{height}"]
         video += ["-framerate", str(info.fps)]
         sound, mapped = list[str](), ["-map", "0:v:0"]
@@ -107,7 +106,7 @@ class FrameWriter(Closing):
 
     def write(self, frame: NDArray[np.uint8]) -> None:
         """Send one frame to ffmpeg."""
-        planes_from_rgb(frame, self._planes, self._channels)
+        planes_from_rgb(frame, self._planes)
         self.repeat()
 
     def repeat(self) -> None:
