@@ -1,3 +1,4 @@
+import gc
 import os
 from pathlib import Path
 
@@ -6,8 +7,14 @@ import pytest
 from hypothesis import settings
 
 matplotlib.use("Agg")
-settings.register_profile("steady", derandomize=True, deadline=None, max_examples=50)
+settings.register_profile("steady", derandomize=True, deadline=None, max_examples=25)
 settings.load_profile("steady")
+
+
+def pytest_collection_finish():
+    """Leave what the imports have made, about a million objects, out of garbage collections."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

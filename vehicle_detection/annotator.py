@@ -121,7 +121,7 @@ Trail = deque[tuple[float, Point]]  # times (s) and positions (pixels) of a trac
 
 # Distance between the lines of the grid (the camera is in the middle of its lane), largest standard error of
 # a speed that is shown (m/s), and time that a trail covers.
-LANE_WIDTH_M, MAX_SPEED_STD, TRAIL_SECONDS = 3.6, 3.0, 1.5
+_LANE_WIDTH_M, MAX_SPEED_STD, _TRAIL_SECONDS = 3.6, 3.0, 1.5
 # Distances with a line and a number, by units; and distance (m) that the view covers ahead of the camera and
 # behind it.
 _RANGES = {"metric": (20, 40, 60), "imperial": (75, 150, 225)}
@@ -258,15 +258,15 @@ class BirdsEyePanel:
             point = points[key]
             if point is not None and not (trail and time < trail[-1][0] + _TRAIL_STEP):
                 trail.append((time, point))
-            while trail and trail[0][0] < time - TRAIL_SECONDS:
+            while trail and trail[0][0] < time - _TRAIL_SECONDS:
                 trail.popleft()
 
     def _draw_grid(self, height: int, width: int, units: str) -> Image:
         """Draw lanes, lines across the road with their distances, and the own car."""
         grid = np.full((height, width, 3), _BACKGROUND, np.uint8)
-        lanes = int(width / 2 / self._scale / LANE_WIDTH_M + 0.5)
+        lanes = int(width / 2 / self._scale / _LANE_WIDTH_M + 0.5)
         for number in range(-lanes, lanes):
-            x = self._column((number + 0.5) * LANE_WIDTH_M)
+            x = self._column((number + 0.5) * _LANE_WIDTH_M)
             cv2.line(grid, (x, 0), (x, height), _GRID_COLOR, self._line)
         chosen = UNITS[units]
         for distance in _RANGES[units]:

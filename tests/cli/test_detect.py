@@ -63,7 +63,7 @@ def test_detect_keeps_boxes_of_a_minimum_confidence(tmp_path):
 
 
 def test_a_wrong_horizon_gives_a_warning(tmp_path):
-    scene = road((15, 0), (19, 3.6), (28, -3.6), (38, 0.3), (42, 3.4), random_state=3)
+    scene = road((13, 0), (16, 3.6), (18, -3.6), (22, 0.3), (24, 3.4), shape=(480, 854), random_state=3)
     write_image(tmp_path / "road.png", scene.image)
     assert ": 0 vehicles" not in succeed("detect", tmp_path / "road.png", "--horizon", 0.95)
     highway = "--model", "highway"  # the network searches all rows

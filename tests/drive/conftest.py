@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -12,7 +13,7 @@ from tests.helpers import ROOT, start_interruptible, write_network
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.scenes import render_drive
 
-TRIPS = 10
+TRIPS = 6
 CUT = 4  # the trip with a damaged file
 
 
@@ -53,7 +54,7 @@ def card(clip, tmp_path):
 
 @pytest.fixture
 def many(clip, tmp_path):
-    """Ten files, of which one is cut."""
+    """Six files, of which one is cut."""
     folder = tmp_path / "many"
     folder.mkdir()
     for number in range(TRIPS):
@@ -61,6 +62,12 @@ def many(clip, tmp_path):
     cut = folder / f"drive {chr(97 + CUT)}.mp4"
     cut.write_bytes(cut.read_bytes()[:4000])
     return folder
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """Process the trips of the command in this process, without the start of a worker."""
+    monkeypatch.setattr("vehicle_detection.drive.batch.WorkerPool", lambda *_: ThreadPoolExecutor(1))
 
 
 @pytest.fixture

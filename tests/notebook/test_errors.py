@@ -4,7 +4,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.drawing.cases import track
 from tests.helpers import random_classifier
 from tests.notebook.helpers import SMALL, gray_image
 from vehicle_detection import notebook
@@ -44,7 +43,6 @@ RESULT = FrameResult(0, None, NONE, NONE, ())
         ("plot_speedups", [{"a": 1.0}], {"reference": "d"}, "reference"),
         ("plot_heatmap", [IMAGE, [[0, 0, 1, 1]]], {}, "windows"),
         ("plot_heatmap", [IMAGE, NONE], {"heat": np.zeros((5, 5))}, "heat must be .* add_heat"),
-        ("plot_birds_eye", [[track()]], {}, "results must be .* pass what detector.process"),
         ("show_images", [[IMAGE]], {"figure": 3}, "figure must be .* pass a Figure"),
         ("show_images", [IMAGE], {}, "images must be a list of images.* wrap a single one in a list"),
         ("show_images", [[IMAGE / 255]], {}, r"images\[0\] must be .* scale its values 0-1"),

@@ -37,7 +37,7 @@ def example_table(count):
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".jsonl"])
-@settings(max_examples=40)
+@settings(max_examples=12)
 @given(cut=st.integers(0, 10**6), count=st.integers(0, 5))
 def test_a_file_cut_anywhere_keeps_its_complete_lines(tmp_path_factory, suffix, cut, count):
     path = tmp_path_factory.mktemp("cut") / f"rows{suffix}"

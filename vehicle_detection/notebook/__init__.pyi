@@ -22,7 +22,6 @@ from .search import plot_comparison as plot_comparison
 from .search import plot_heatmap as plot_heatmap
 from .search import plot_speedups as plot_speedups
 from .search import plot_windows as plot_windows
-from .tracks import plot_birds_eye as plot_birds_eye
 from .tracks import plot_stage_times as plot_stage_times
 from .tracks import plot_tracks as plot_tracks
 
