@@ -46,6 +46,7 @@ MAX_SECONDS = 60
 NOT_CALLED = {
     "course.set_lesson_defaults": "changes later calls; tests/test_course_versions.py",
     "course.detect_versions": "takes a module; tests/test_course_versions.py",
+    "open_dask": "starts a cluster",
     "write_video": "takes what track returned; tests/video/test_writing.py",
     "fetch_patches": "downloads; its arguments are tested in tests/datasets/test_archives.py",
     "Detections.to_supervision": "needs the package supervision; tests/test_boxes.py",

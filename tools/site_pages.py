@@ -53,7 +53,7 @@ SUBPACKAGE_NAMES = {
         "find_near_duplicates Split split_groups split_leakage split_random split_sequences split_sources"
     ),
     "drive": (
-        "batch_status batch_summary BatchReport BatchStatus cut_clips Event find_trips "
+        "batch_status batch_summary BatchReport BatchStatus cut_clips Event find_trips open_dask "
         "OwnSpeed Trip VehicleCounts"
     ),
     "evaluation": (

@@ -1,6 +1,7 @@
 """Faults of batches: real processes that are killed, and what the next run does."""
 
 import contextlib
+import json
 import os
 import re
 import shlex
@@ -19,7 +20,8 @@ from tests.drive.conftest import TRIPS
 from tests.helpers import ROOT
 from tests.video.clips import child_processes
 from vehicle_detection import run_batch
-from vehicle_detection.drive import batch_status
+from vehicle_detection.drive import batch_status, open_dask
+from vehicle_detection.errors import InvalidInputError
 
 pytestmark = pytest.mark.usefixtures("private_scratch")
 
@@ -156,3 +158,58 @@ def test_a_worker_that_dies_in_every_attempt_is_an_error(card, model, tmp_path, 
 
 def kill_this_process(task):
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_dask_cluster_that_loses_a_worker(many, model, tmp_path, start_batch):
+    pytest.importorskip("distributed")
+    out = tmp_path / "out"
+    with unfinished(out, last_of(many)):
+        process = start_batch(many, out, model, "--dask", "local", "--tracks-only")
+        wait_for_records(out, 1)
+        os.kill(processes_below(process.pid)[0], signal.SIGKILL)
+    code, printed, errors = finish(process)
+    assert code == 0, errors
+    assert printed.startswith("dashboard http")
+    check_numbers(printed)
+    check_whole(out, done=TRIPS - 1, failed=1)
+
+
+def test_a_killed_scheduler_ends_the_run_and_the_next_one_does_the_rest(
+    many, model, tmp_path, start, start_batch, monkeypatch
+):
+    pytest.importorskip("distributed")
+    monkeypatch.setenv("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "3s")
+    monkeypatch.setenv("VEHICLE_DETECTION_JOBS", "1")
+    file, out = tmp_path / "scheduler.json", tmp_path / "out"
+    words = ["--scheduler-file", file, "--no-dashboard"]
+    scheduler = start("-m", "distributed.cli.dask_scheduler", "--port", 0, *words)
+    worker = start("-m", "distributed.cli.dask_worker", *words, "--nthreads", 1, "--death-timeout", 20)
+    wait_until(lambda: file.exists() and file.read_text().endswith("}"))
+    address = json.loads(file.read_text())["address"]
+    with unfinished(out, last_of(many)):
+        process = start_batch(many, out, model, "--tracks-only", "--dask", address)
+        wait_for_records(out, 1)
+        scheduler.kill()
+        code, _, errors = finish(process)
+    assert code == 1, errors
+    assert "the Dask scheduler does not answer any more" in errors
+    assert "run_batch" not in errors, "a traceback of our own; Dask may log some"
+    worker.terminate()
+    before = files(out / "records", "[!.]*.json")
+    code, _, errors = finish(start_batch(many, out, model, "--tracks-only"))
+    assert code == 0, errors
+    check_whole(out, done=TRIPS - 1, failed=1)
+    assert before.items() <= files(out / "records").items(), "a trip was done twice"
+
+
+def test_a_scheduler_that_does_not_answer(monkeypatch):
+    pytest.importorskip("distributed")
+    message = "dask must be local or the address of a scheduler"
+    with pytest.raises(InvalidInputError, match=message), open_dask("nonsense://127.0.0.1:9"):
+        pass
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with (
+        pytest.raises(InvalidInputError, match=r"dask needs .*; pip install 'dask\[distributed\]'"),
+        open_dask("local"),
+    ):
+        pass

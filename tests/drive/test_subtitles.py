@@ -4,9 +4,11 @@ import dataclasses
 import re
 import subprocess
 
+import numpy as np
 import pytest
 
 from tests.drawing.cases import track
+from tests.video.clips import write_clip
 from vehicle_detection import InvalidInputError, TrackTable, write_subtitles
 from vehicle_detection.drive import Event, OwnSpeed
 from vehicle_detection.video.ffmpeg import ffmpeg_binary
@@ -82,8 +84,10 @@ def test_oncoming_vehicles_and_unknown_values(tmp_path):
     assert list(read_cues(path).values()) == [["1 vehicle"]]
 
 
-def test_players_read_the_file(tmp_path):
-    target = tmp_path / "found.srt"
+@pytest.mark.parametrize("suffix", [".srt", ".ass"])
+def test_players_read_both_formats(tmp_path, suffix):
+    clip, target = tmp_path / "clip.mp4", tmp_path / f"found{suffix}"
+    write_clip(clip, [np.zeros((64, 96, 3), np.uint8)] * 10)
     write_subtitles(drive(), target, fps=10, events=[EVENT], own_speed=OwnSpeed.constant(20.0))
     command = [ffmpeg_binary(), "-v", "error", "-i", target, "-f", "srt", "-"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -101,12 +105,14 @@ def test_empty_and_long_videos(tmp_path):
         table.append(frame, float(frame), [])
     write_subtitles(table, tmp_path / "a.srt", fps=1)
     assert "--> 01:01:40,000" in (tmp_path / "a.srt").read_text()
+    write_subtitles(table, tmp_path / "a.ass", fps=1)
+    assert "Dialogue: 0,0:00:00.00,1:01:40.00,Default,,0,0,0,,no vehicle" in (tmp_path / "a.ass").read_text()
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"path": "found.txt"}, r"path must end in .srt, got 'found.txt'; write 'found.srt'"),
+        ({"path": "found.txt"}, r"path must end in .srt or .ass, got 'found.txt'; write 'found.srt'"),
         ({"path": "none/found.srt"}, "path needs an existing folder"),
         ({"table": []}, "table must be a TrackTable"),
         ({"fps": 0}, "fps must be a number, greater than 0"),

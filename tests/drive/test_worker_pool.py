@@ -1,5 +1,6 @@
-"""The worker processes of a batch."""
+"""The worker processes of a batch, and the executor of a Dask cluster."""
 
+import contextlib
 import gc
 import logging
 import os
@@ -8,12 +9,13 @@ import sys
 import time
 from multiprocessing import resource_tracker
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from tests.helpers import ROOT
 from tests.video.clips import child_processes
-from vehicle_detection.drive import worker_pool
+from vehicle_detection.drive import open_dask, worker_pool
 from vehicle_detection.drive.worker_pool import WorkerLost, WorkerPool
 
 pytestmark = pytest.mark.usefixtures("private_scratch")
@@ -151,3 +153,26 @@ def test_kernels_of_another_user_are_not_loaded(monkeypatch, tmp_path, caplog, k
         folder.write_text("")
     assert "NUMBA_CACHE_DIR" not in worker_pool.worker_environment()
     assert "kernels are kept elsewhere" in caplog.text
+
+
+def test_a_dask_cluster_has_single_threads_and_may_lose_workers(monkeypatch):
+    """Dask blames a lost worker on all trips that were waiting there."""
+    dask, distributed = pytest.importorskip("dask"), pytest.importorskip("distributed")
+    seen = {}
+
+    @contextlib.contextmanager
+    def cluster(**options):
+        seen.update(options, failures=dask.config.get("distributed.scheduler.allowed-failures"))
+        yield "cluster"
+
+    @contextlib.contextmanager
+    def client(target):
+        yield SimpleNamespace(dashboard_link=f"http://{target}")
+
+    monkeypatch.setattr(distributed, "LocalCluster", cluster)
+    monkeypatch.setattr(distributed, "Client", client)
+    with open_dask("local", 3) as (_, dashboard):
+        assert dashboard == "http://cluster"
+    assert (seen["n_workers"], seen["threads_per_worker"], seen["processes"]) == (3, 1, True)
+    assert seen["failures"] >= 20
+    assert seen["env"]["VEHICLE_DETECTION_JOBS"] == "1"

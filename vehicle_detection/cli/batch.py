@@ -46,6 +46,9 @@ class BatchOptions:
     conf: float | None = shared.CONFIDENCE
     jobs: int | None = option(None, "N", "Worker processes of one thread, such as 4; default: one per core.")
     shard: str | None = option(None, "I/N", "Process the I-th of N parts, such as 2/8, for job arrays.")
+    dask: str | None = option(
+        None, "ADDRESS|local", "Use a Dask cluster, such as tcp://10.0.0.5:8786, or start one here."
+    )
     group: str = option("trip", "trip|file", "Make consecutive segments one trip, or each file.")
     tracks_only: bool = flag("--tracks-only", "Write no videos.")
     horizon: float | None = shared.HORIZON
@@ -105,10 +108,15 @@ def batch(options: BatchOptions) -> None:
 
 
 def _run(options: BatchOptions, sources: list[str]) -> Any:
-    """Process the trips of the sources."""
+    """Process the trips of the sources, on a Dask cluster if one is named."""
     from vehicle_detection._common import is_url, local_path
 
     with contextlib.ExitStack() as stack:
+        executor = None
+        if options.dask is not None and not options.dry_run:
+            executor, dashboard = stack.enter_context(vd.drive.open_dask(options.dask, options.jobs))
+            if not options.quiet:
+                print_line(f"dashboard {dashboard}")
         folder = local_path(options.output)
         if folder and not options.dry_run and not is_url(folder):
             stack.enter_context(output_folder(Path(folder), "--output"))
@@ -116,6 +124,7 @@ def _run(options: BatchOptions, sources: list[str]) -> Any:
         return vd.run_batch(
             sources,
             options.output,
+            executor,
             options=options.detector_options(),
             audio=not options.no_audio,
             progress=shown,

@@ -57,7 +57,7 @@ class VideoOptions:
         None, "KINDS", "Kinds of events for --clips, such as cut_in,closing; default: all."
     )
     srt: Path | None = output_option(
-        None, "FILE", "Subtitles with vehicles, nearest distance and events, second by second: .srt."
+        None, "FILE", "Subtitles with vehicles, nearest distance and events, second by second: .srt or .ass."
     )
     preset: str = shared.PRESET
     no_audio: bool = shared.NO_AUDIO

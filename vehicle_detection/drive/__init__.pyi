@@ -7,6 +7,7 @@ from .report import ReportWriter, explain_tracks
 from .report_page import TrackPicture
 from .subtitles import SUBTITLE_SUFFIXES, write_subtitles
 from .trips import Trip, find_trips, open_trip, segment_clock
+from .worker_pool import open_dask
 
 __all__ = [
     "COUNTED",
@@ -30,6 +31,7 @@ __all__ = [
     "explain_tracks",
     "find_events",
     "find_trips",
+    "open_dask",
     "open_trip",
     "own_speeds",
     "read_own_speed",

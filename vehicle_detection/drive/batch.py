@@ -167,7 +167,7 @@ def run_batch(
         Folder, or a URL that fsspec knows, such as ``"s3://bucket/results"``. Several runs, also on several
         machines, may share one; at a URL, which has no locks, two of them may both process a trip.
     executor
-        A ``concurrent.futures`` executor, such as that of a Dask client, whose workers see the same files.
+        A ``concurrent.futures`` executor, such as that of `open_dask`, whose workers see the same files.
         None: worker processes of this machine, which import the running script, so that a script calls this
         function below ``if __name__ == "__main__":``.
     model, options

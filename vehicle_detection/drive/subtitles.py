@@ -28,11 +28,27 @@ from vehicle_detection.drive.history import TrackHistory, track_histories
 from vehicle_detection.drive.own_speed import OwnSpeed, own_speeds
 from vehicle_detection.tables import TrackTable
 
-SUBTITLE_SUFFIXES = (".srt",)
+SUBTITLE_SUFFIXES = (".srt", ".ass")
 """Suffixes of files of subtitles."""
 
 # Seconds for which an event is shown.
 _EVENT_SECONDS = 3
+_ASS_HEADER = """\
+[Script Info]
+ScriptType: v4.00+
+WrapStyle: 0
+PlayResX: 1280
+PlayResY: 720
+
+[V4+ Styles]
+Format: Name, Fontname, Fontsize, PrimaryColour, SecondaryColour, OutlineColour, BackColour, Bold, Italic, \
+Underline, StrikeOut, ScaleX, ScaleY, Spacing, Angle, BorderStyle, Outline, Shadow, Alignment, \
+MarginL, MarginR, MarginV, Encoding
+Style: Default,Arial,26,&H00FFFFFF,&H00FFFFFF,&H00000000,&H80000000,0,0,0,0,100,100,0,0,1,2,0,7,16,16,12,1
+
+[Events]
+Format: Layer, Start, End, Style, Name, MarginL, MarginR, MarginV, Effect, Text
+"""
 
 
 class _Nearest(NamedTuple):
@@ -64,7 +80,7 @@ def write_subtitles(
     table, fps, events
         The tracks of the video, its frame rate, and what `find_events` found in the tracks.
     path
-        ``.srt`` (SubRip).
+        ``.srt`` (SubRip) or ``.ass`` (Advanced SubStation Alpha, in the upper left corner).
     own_speed
         Speed of the camera's vehicle over the time of the source. Where it is known, speeds are those over
         ground; elsewhere they are relative to the camera.
@@ -97,10 +113,16 @@ def write_subtitles(
     listed = check_events(events)
     cues = list(_merge(_second_texts(table, rate, listed, own_speed, UNITS[units])))
     end = len(table.counts()) / rate
-    text = ""
+    is_ass = target.suffix.lower() == ".ass"
+    text = _ASS_HEADER if is_ass else ""
     for number, (start, stop, lines) in enumerate(cues, start=1):
-        said = "\n".join(lines)
-        text += f"{number}\n{_srt_time(start)} --> {_srt_time(min(stop, end))}\n{said}\n\n"
+        last = min(stop, end)
+        if is_ass:
+            times, said = f"{_ass_time(start)},{_ass_time(last)}", r"\N".join(lines)
+            text += f"Dialogue: 0,{times},Default,,0,0,0,,{said}\n"
+        else:
+            said = "\n".join(lines)
+            text += f"{number}\n{_srt_time(start)} --> {_srt_time(last)}\n{said}\n\n"
     write_text(target, text, "path")
     return len(cues)
 
@@ -182,3 +204,8 @@ def _merge(texts: Iterable[tuple[str, ...]]) -> Iterator[tuple[int, int, tuple[s
 def _srt_time(seconds: float) -> str:
     whole, milliseconds = divmod(round(seconds * 1000), 1000)
     return f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d},{milliseconds:03d}"
+
+
+def _ass_time(seconds: float) -> str:
+    whole, hundredths = divmod(round(seconds * 100), 100)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}.{hundredths:02d}"

@@ -1,4 +1,4 @@
-"""The workers of a batch: processes of this machine.
+"""The workers of a batch: processes of this machine, or those of a Dask cluster.
 
 A worker process calls one function at a time. It is a pool of its own, opened again after it has died: in a
 pool of several processes, one that is killed would end the calls of all others.
@@ -13,17 +13,27 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import (
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
 from types import FrameType
 from typing import Any
 
-from vehicle_detection._common import JOBS_VARIABLE, postpone, private_folder
+from vehicle_detection._common import JOBS_VARIABLE, available_cores, postpone, private_folder
+from vehicle_detection.errors import InvalidInputError
 
 _LOGGER = logging.getLogger(__name__)
 # Seconds that the current call has to clean up after the parent process has ended.
 _GRACE = 15.0
+# Dask blames a lost worker on all its tasks; its default of 3 would fail innocent trips.
+_ALLOWED_FAILURES = 20
 
 
 class WorkerLost(Exception):  # noqa: N818 - named after what happened, as BrokenExecutor is
@@ -133,6 +143,82 @@ def _environment(changes: dict[str, str]) -> Iterator[None]:
         for name in changes:
             os.environ.pop(name, None)
         os.environ.update({name: value for name, value in before.items() if value is not None})
+
+
+@contextlib.contextmanager
+def open_dask(address: str, jobs: int | None = None) -> Iterator[tuple[Executor, str]]:
+    """Connect to a Dask scheduler, or start one; yield the executor for `run_batch` and the dashboard's URL.
+
+    Parameters
+    ----------
+    address
+        Address of a scheduler, such as ``"tcp://host:8786"``, or ``"local"`` to start one on this machine.
+    jobs
+        Number of worker processes, of one thread each, of a local scheduler; None: one per core.
+
+    Examples
+    --------
+    >>> with open_dask("local", jobs=4) as (executor, dashboard):  # doctest: +SKIP
+    ...     report = run_batch("card", "results", executor)
+    """
+    try:
+        import dask
+        import distributed
+    except ImportError:
+        raise InvalidInputError(
+            "dask needs dask[distributed]; pip install 'dask[distributed]', or omit it"
+        ) from None
+    scheduler = "distributed.scheduler"
+    options = {f"{scheduler}.allowed-failures": _ALLOWED_FAILURES, f"{scheduler}.worker-saturation": 1.0}
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(dask.config.set(options))
+        target = address
+        if address == "local":
+            workers = {"n_workers": jobs or available_cores(), "threads_per_worker": 1, "processes": True}
+            cluster = distributed.LocalCluster(**workers, dashboard_address=":0", env=worker_environment())
+            target = stack.enter_context(cluster)
+        try:
+            client = stack.enter_context(distributed.Client(target))
+        except (OSError, ValueError) as error:
+            raise InvalidInputError(
+                f"dask must be local or the address of a scheduler such as tcp://host:8786, got {address!r}; "
+                f"{error}"
+            ) from None
+        yield _DaskExecutor(client), client.dashboard_link
+
+
+class _DaskExecutor(Executor):
+    """Executor of a Dask client, whose futures also end when the scheduler does.
+
+    Those of ``client.get_executor()`` wait forever for a result that was lost on the way.
+    """
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Call a function on a worker; `BrokenExecutor` if the scheduler is gone."""
+        future: Future[Any] = Future()
+        try:
+            remote = self._client.submit(fn, *args, **kwargs, pure=False)
+        except Exception as error:
+            raise self._translate(error) from error
+        future.set_running_or_notify_cancel()
+
+        def finish(done: Any) -> None:
+            try:
+                future.set_result(done.result())
+            except BaseException as error:
+                future.set_exception(self._translate(error))
+
+        remote.add_done_callback(finish)
+        return future
+
+    def _translate(self, error: BaseException) -> BaseException:
+        """Tell the loss of the scheduler from errors of a call."""
+        if self._client.status == "running":
+            return RuntimeError(str(error)) if isinstance(error, CancelledError) else error
+        return BrokenExecutor("the Dask scheduler does not answer any more")
 
 
 # What follows runs in the worker process.
