@@ -239,7 +239,7 @@ def test_a_camera_file_by_hand(tmp_path):
     [
         ("{", r"camera file .+ is not JSON"),
         pytest.param("[" * 100_000, r"camera file .+ is not JSON: it is nested too deeply", id="deep"),
-        ("[1]", r"camera file .+ must be an object with the names .*; got \[1\]"),
+        ("[1]", r"camera file .+ must be an object with the names of read_camera; got"),
         ('{"zoom": 1}', r"must be an object with the names .*; got zoom"),
         ('{"focal_px": 900}', r"camera.json: focal_px needs image_size"),
         (
@@ -269,3 +269,109 @@ def test_a_camera_of_another_size_rectifies_as_one_of_this_size(lens):
     boxes = np.array([[450.0, 200, 550, 260]])
     np.testing.assert_allclose(large.rectify_boxes(boxes, (360, 640)), small.rectify_boxes(boxes, (360, 640)))
     assert large.to_pinhole((360, 640)).horizon_px == pytest.approx(small.to_pinhole((360, 640)).horizon_px)
+
+
+@pytest.mark.parametrize(
+    ("stated", "warning"),
+    [
+        ({"fov": 140}, "may be that along the diagonal"),
+        ({"height_m": 0.13}, "height of 0.13 m is unusual"),
+        ({"height_m": 13}, "height of 13 m is unusual"),
+        ({"fov": 110, "height_m": 3.2}, ""),
+    ],
+)
+def test_unusual_cameras_give_a_warning(stated, warning, caplog):
+    open_camera(**stated)
+    assert warning in caplog.text
+    assert bool(caplog.text) == bool(warning)
+
+
+MATRIX = np.array([[1000.0, 0, 645], [0, 1004, 355], [0, 0, 1]])
+ROS = """image_width: 1280
+image_height: 720
+camera_name: front
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [{matrix}]
+distortion_model: {model}
+distortion_coefficients:
+  rows: 1
+  cols: {count}
+  data: [{distortion}]
+"""
+
+
+def write_calibration(path, distortion, *, fisheye=False, ros=False):
+    """Write a calibration as OpenCV's programs do, or ROS."""
+    if ros:
+        values = {"matrix": MATRIX.ravel(), "distortion": distortion}
+        text = {name: ", ".join(map(str, row)) for name, row in values.items()}
+        model = "equidistant" if fisheye else "plumb_bob"
+        path.write_text(ROS.format(**text, model=model, count=len(distortion)))
+        return
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    file.write("calibration_time", "Mon 02 Feb 2026")
+    for name, value in (("image_width", 1280), ("image_height", 720), ("fisheye_model", int(fisheye))):
+        file.write(name, value)
+    file.write("camera_matrix", MATRIX)
+    file.write("distortion_coefficients", np.array(distortion).reshape(-1, 1))
+    file.release()
+
+
+@pytest.mark.parametrize(
+    ("suffix", "ros"), [(".yml", False), (".xml", False), (".json", False), (".yaml", True)]
+)
+@pytest.mark.parametrize(
+    ("distortion", "fisheye"),
+    [
+        ([-0.25, 0.05, 0.0, 0.0, 0.0], False),
+        ([0.1, -0.02, 0.0, 0.0, 0.0], False),
+        ([0.0, 0.0, 0.0, 0.0, 0.0], False),
+        ([0.02, -0.005, 0.001, 0.0], True),
+    ],
+)
+def test_calibrations_of_opencv_and_ros(distortion, fisheye, suffix, ros, tmp_path):
+    write_calibration(path := tmp_path / f"camera{suffix}", distortion, fisheye=fisheye, ros=ros)
+    camera = read_camera(path)
+    assert camera.lens_is_known
+    assert not camera.horizon_is_known
+    # A point is where OpenCV projects it, and comes back as that of a pinhole.
+    rays = np.array([[x, y, 1.0] for x in (-0.5, 0.2, 0.45) for y in (-0.2, 0.01, 0.3)])
+    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+    matrix = np.array([[1002.0, 0, 640], [0, 1002, 360], [0, 0, 1]])
+    zero = np.zeros(3)
+    points = project(rays[:, None], zero, zero, matrix, np.array(distortion))[0][:, 0]
+    boxes = np.concatenate([points - 2, points + 2], axis=1)
+    boxes = camera.rectify_boxes(boxes, SHAPE)
+    expected = 1002 * rays[:, :2] + [640, 360]
+    assert (boxes[:, :2] + boxes[:, 2:]) / 2 == pytest.approx(expected, abs=6)
+    assert open_camera(path, height_m=1.5, horizon=0.5).height_m == 1.5
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.yaml", "camera_matrix: {data: [1, 2]}", "must hold image_width, image_height"),
+        ("a.yaml", ROS.format(matrix="1, " * 9, model="", count=0, distortion=""), "fit the image"),
+        ("a.yaml", ROS.format(matrix="900,0,640,0,500,360,0,0,1", model="", count=0, distortion=""), "agree"),
+        (
+            "a.yaml",
+            ROS.format(matrix="900,0,640,0,900,360,0,0,1", model="", count=2, distortion="-9,50"),
+            "fits",
+        ),
+        (
+            "a.yaml",
+            ROS.format(matrix="900,0,640,0,.nan,360,0,0,1", model="", count=0, distortion=""),
+            "finite",
+        ),
+        ("a.yaml", "a: [", "is not YAML"),
+        ("a.yaml", "- 1", "must be an object"),
+        ("a.xml", "<a", "is not XML"),
+        ("a.xml", "<!DOCTYPE a><opencv_storage><image_width>9</image_width></opencv_storage>", "must hold"),
+    ],
+)
+def test_calibrations_that_cannot_be_used(name, text, message, tmp_path):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InvalidInputError, match=message):
+        read_camera(tmp_path / name)

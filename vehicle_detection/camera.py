@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import math
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,22 +44,30 @@ from vehicle_detection._common import (
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 
+_LOGGER = logging.getLogger(__name__)
+
 FrameShape = tuple[int, int]
 """Height and width of a frame in pixels."""
 
 # Frame to which the numbers of a camera without a shape refer, and focal length in pixels (0.9 times the
 # width) for which pixel errors are given.
 _REFERENCE_SHAPE, _REFERENCE_FOCAL_PX = (720, 1280), 0.9 * 1280
-# Relative standard error of the focal length of a typical lens, of a given field of view, and of a guess.
-_LENS_STD, _GIVEN_LENS_STD, _UNKNOWN_LENS_STD = 0.08, 0.03, 0.25
+# Relative standard error of the focal length of a typical lens, of a given field of view, of a calibrated
+# lens, and of a guess.
+_LENS_STD, _GIVEN_LENS_STD, _CALIBRATED_LENS_STD, _UNKNOWN_LENS_STD = 0.08, 0.03, 0.01, 0.25
+# Fractions of the frame by which the middle of a lens may differ, and of a radius that is no distortion.
+_MAX_SHIFT, _NEGLIGIBLE = 0.05, 0.003
 # Standard error of a given height of the camera (m).
 _GIVEN_HEIGHT_STD = 0.05
 # Horizon of an unknown camera, its standard error, that of a given horizon, and the largest one of a horizon
 # that counts as known; fractions of the frame's height. The first is that of a level camera.
 _HORIZON, _HORIZON_STD, _GIVEN_HORIZON_STD, _KNOWN_HORIZON_STD = 0.5, 0.06, 0.004, 0.02
+# Field of view (degrees) above which lenses distort, and usual heights of cameras in cars and trucks (m).
+_MAX_PINHOLE_FOV, _HEIGHTS = 120.0, (0.6, 3.5)
 # Largest angle from the optical axis (radians) at which boxes are converted to a pinhole camera.
 _MAX_ANGLE = math.radians(80)
 
+_CALIBRATIONS = {".yaml": "YAML", ".yml": "YAML", ".xml": "XML"}  # of OpenCV and ROS, besides JSON
 _PIXEL_FIELDS = ("focal_px", "horizon_px", "horizon_std_px")  # in pixels of the frame
 
 LENSES: dict[str, tuple[float, bool]] = {
@@ -364,14 +374,22 @@ def open_camera(
     """Return the camera that a user has stated, of which any part may be unknown.
 
     `camera` is a `Camera`, a file of `read_camera`, or the name of a lens. The other arguments are those of
-    `Camera.dashcam`: `fov` for an unknown lens, `height_m` also for a named one; `horizon` replaces that of
-    the camera.
+    `Camera.dashcam`: `fov` for an unknown lens, `height_m` also for a named one and a file; `horizon`
+    replaces that of the camera.
 
     >>> open_camera("wide-90", horizon=0.55).horizon_px
     396.00000000000006
     """
     named = camera is None or (isinstance(camera, str) and camera in LENSES)
-    for name, value, allowed in (("fov", fov, camera is None), ("height_m", height_m, named)):
+    if isinstance(fov, (int, float)) and _MAX_PINHOLE_FOV < fov <= 170:
+        advice = "state that along the longer side, or choose a fisheye lens"
+        _LOGGER.warning("a field of view of %g degrees may be that along the diagonal; %s", fov, advice)
+    if isinstance(height_m, (int, float)) and not _HEIGHTS[0] <= height_m <= _HEIGHTS[1]:
+        _LOGGER.warning("a camera height of %g m is unusual; distances are proportional to it", height_m)
+    for name, value, allowed in (
+        ("fov", fov, camera is None),
+        ("height_m", height_m, not isinstance(camera, Camera)),
+    ):
         if value is not None and not allowed:
             raise InvalidInputError(f"{name} must be omitted with a camera, which has one; got {value}")
     if named:
@@ -385,6 +403,9 @@ def open_camera(
                 "omit it"
             )
         camera = read_camera(camera)  # type: ignore[arg-type]
+        if height_m is not None:
+            height = check_number(height_m, "height_m", above=0, high=100)
+            camera = dataclasses.replace(camera, height_m=height, height_std_m=_GIVEN_HEIGHT_STD)
     return camera if horizon is None else camera.with_horizon(horizon)
 
 
@@ -405,10 +426,15 @@ def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int,
 
 
 def read_camera(path: str | os.PathLike[str]) -> Camera:
-    """Read a camera from a JSON file, of `write_camera` or by hand, for its ``image_size`` or for any.
+    """Read a camera from a JSON file, of `write_camera` or by hand, or from a calibration of OpenCV or ROS.
 
-    The file is an object with attributes of `Camera`, all of them optional. Instead of ``focal_px`` it may
-    hold ``fov`` (degrees along the longer side) or ``lens`` (as in `Camera.for_frame`), and instead of
+    A calibration (``.yaml``, ``.xml`` or ``.json`` with ``camera_matrix``, ``distortion_coefficients`` and
+    the size of the images) states the lens, not the height or the horizon. Its distortion, of a pinhole or a
+    fisheye, is converted to that of `Camera`. Tangential distortion, and a principal point that is not the
+    middle, are left out.
+
+    Any other file is an object with attributes of `Camera`, all of them optional. Instead of ``focal_px`` it
+    may hold ``fov`` (degrees along the longer side) or ``lens`` (as in `Camera.for_frame`), and instead of
     ``horizon_px`` ``horizon`` (a fraction of the height). With pixels it needs ``image_size``, ``[width,
     height]``. A lens or horizon that it lacks gets a large standard error.
 
@@ -420,7 +446,10 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
     (598, 1.4)
     """
     path = check_path(path)
-    values = _read_json(path)
+    values = _read_values(path)
+    if "camera_matrix" in values or path.suffix.lower() in _CALIBRATIONS:
+        return _from_calibration(path, values)
+    _check_names(path, values)
     size = values.pop("image_size", None)
     if size is not None and (not isinstance(size, list) or len(size) != 2):
         raise InvalidInputError(f"{path}: image_size must be [width, height], got {describe(size)}")
@@ -443,24 +472,113 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
         raise InvalidInputError(f"{path}: {error}") from None
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    """Read the object in a JSON file, and check its names."""
+def _read_values(path: Path) -> dict[str, Any]:
+    """Read the object in a JSON file, or that of a calibration in YAML or XML."""
     data = read_regular_file(path, f"camera file {path}", Limit.TEXT_BYTES)
+    kind = _CALIBRATIONS.get(path.suffix.lower(), "JSON")
     try:
-        values: Any = json.loads(data)
+        parse = {"YAML": _parse_yaml, "XML": _parse_xml}.get(kind, json.loads)
+        values: Any = parse(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else error
-        raise InvalidInputError(f"camera file {path} is not JSON: {reason}; see read_camera") from None
+        raise InvalidInputError(f"camera file {path} is not {kind}: {reason}; see read_camera") from None
+    if not isinstance(values, dict):
+        raise InvalidInputError(
+            f"camera file {path} must be an object with the names of read_camera; got {describe(values)}"
+        )
+    return values
+
+
+def _parse_yaml(text: str) -> Any:
+    """Parse YAML of ROS, or of OpenCV, whose first line and tags are its own."""
+    import yaml
+
+    try:
+        return yaml.safe_load(re.sub(r"^%YAML:.*|!!opencv-matrix", "", text))
+    except yaml.YAMLError as error:
+        raise ValueError(" ".join(str(error).split())) from None
+
+
+def _parse_xml(text: str) -> dict[str, Any]:
+    """Parse XML of OpenCV; it needs no document type, whose entities can expand to any size."""
+    from xml.etree import ElementTree
+
+    try:
+        root: Any = [] if "<!DOCTYPE" in text else ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(str(error)) from None
+    return {part.tag: {each.tag: (each.text or "").split() for each in part} or part.text for part in root}
+
+
+def _from_calibration(path: Path, values: dict[str, Any]) -> Camera:
+    """Return the camera of a calibration."""
+    try:
+        width, height = (max(int(values[f"image_{side}"]), 1) for side in ("width", "height"))
+        matrix = np.array(values["camera_matrix"]["data"], np.float64).reshape(3, 3)
+        stated = values.get("distortion_coefficients") or {"data": []}
+        distortion = np.array(stated["data"], np.float64).reshape(-1)
+        fisheye = bool(int(values.get("fisheye_model") or 0))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InvalidInputError(
+            f"camera file {path} must hold image_width, image_height, camera_matrix and perhaps "
+            f"distortion_coefficients, as OpenCV and ROS write them ({error}); calibrate again"
+        ) from None
+    fisheye |= values.get("distortion_model") in ("equidistant", "fisheye")
+    (fx, _, cx), (_, fy, cy) = matrix[:2]
+    focal, finite = (fx + fy) / 2, np.isfinite(matrix).all() and np.isfinite(distortion).all()
+    if not (finite and 0.1 < focal / max(width, height) < 20 and 0.95 < fx / fy < 1.05):
+        raise InvalidInputError(
+            f"camera file {path} must have finite values, and focal lengths in pixels that fit the image and "
+            f"agree within 5%; got {fx:g} and {fy:g}"
+        )
+    shift = max(abs(cx / width - 0.5), abs(cy / height - 0.5))
+    if shift > _MAX_SHIFT:
+        _LOGGER.warning(
+            "%s: the principal point is %.0f%% from the middle, where it is assumed", path, 100 * shift
+        )
+    angles = np.linspace(0.01, _MAX_ANGLE, 200)
+    radii = _distorted_radii(angles, distortion, fisheye=fisheye)
+    # Up to the corner of the frame.
+    known = np.cumprod((np.diff(radii, prepend=0) > 0) & (radii < np.hypot(width, height) / 2 / focal)) > 0
+    angles, radii = angles[known], radii[known]
+    lens: dict[str, Any] = {}
+    if not len(radii) or np.abs(radii / np.tan(angles) - 1).max() > _NEGLIGIBLE:
+        terms = np.stack([angles**3, angles**5], axis=1)
+        (k1, k2), *_ = np.linalg.lstsq(terms, radii - angles, rcond=None)
+        misfit = np.abs(_fisheye_radius(angles, k1, k2) - radii).max(initial=0.0)
+        if not len(radii) or misfit > 0.01 or max(abs(k1), abs(k2)) > 1:
+            raise InvalidInputError(
+                f"camera file {path} has a distortion that no lens of Camera fits within 1%; calibrate again "
+                "with fewer coefficients"
+            )
+        lens = {"fisheye": True, "k1": float(k1), "k2": float(k2)}
+    camera = Camera.dashcam().for_shape((height, width))
+    return dataclasses.replace(camera, focal_px=float(focal), focal_std=_CALIBRATED_LENS_STD, **lens)
+
+
+def _distorted_radii(angles: Floats, distortion: Floats, *, fisheye: bool) -> Floats:
+    """Distance from the middle in focal lengths of rays, by the models of ``cv2.fisheye`` and OpenCV."""
+    if fisheye:
+        powers = angles[:, None] ** (2 * np.arange(1, len(distortion) + 1))
+        return np.asarray(angles * (1 + powers @ distortion))
+    k1, k2, _, _, k3, k4, k5, k6 = np.pad(distortion, (0, max(8 - len(distortion), 0)))[:8]
+    tangent = np.tan(angles)
+    square = tangent**2
+    above = 1 + square * (k1 + square * (k2 + square * k3))
+    return np.asarray(tangent * above / (1 + square * (k4 + square * (k5 + square * k6))))
+
+
+def _check_names(path: Path, values: dict[str, Any]) -> None:
+    """Check the names in a camera file."""
     known = {"image_size", "fov", "lens", "horizon", *Camera.__dataclass_fields__} - {"shape"}
-    if not isinstance(values, dict) or values.keys() - known:
-        extra = sorted(values.keys() - known)[0] if isinstance(values, dict) else describe(values)
+    if values.keys() - known:
+        extra = min(values.keys() - known, key=str)
         raise InvalidInputError(
             f"camera file {path} must be an object with the names {', '.join(sorted(known))}; got {extra}"
         )
     for first, second in (("fov", "focal_px"), ("lens", "focal_px"), ("horizon", "horizon_px")):
         if first in values and second in values:
             raise InvalidInputError(f"camera file {path} must hold {first} or {second}, not both; drop one")
-    return values
 
 
 def lateral_offsets(boxes: NDArray[Any], shape: tuple[int, ...]) -> Floats:

@@ -4,6 +4,7 @@ import functools
 import math
 import os
 import string
+from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
@@ -55,6 +56,30 @@ class TestGpx:
         places = np.cumsum(rng.normal(scale=0.3 / DEGREE_M, size=(60, 2)), axis=0) * 0.3
         points = [(50 + lat, lon, time_of(second), "") for second, (lat, lon) in enumerate(places)]
         assert read_own_speed(write_gpx(tmp_path / "a.gpx", points)).at(np.arange(60)).max() < 0.3
+
+    @pytest.mark.parametrize(
+        ("hours", "zones"),
+        [(2, ("", "Z")), (-2, ("Z", "")), (-1, ("", "")), (-1, ("Z", "Z")), (-5.5, ("", "+00:00"))],
+    )
+    def test_times_of_two_zones_are_an_error(self, hours, zones, tmp_path):
+        """The receiver finds its zone after 30 s, or summer time ends."""
+        start = datetime(2026, 10, 25, 8)
+        points = []
+        for second in range(60):
+            time = start + timedelta(seconds=second, hours=hours * (second >= 30))
+            points.append((50 + 20 * second / DEGREE_M, 10, time.isoformat() + zones[second >= 30], ""))
+        with pytest.raises(InvalidInputError, match="point 31, .+ another time zone than .+ before it"):
+            read_own_speed(write_gpx(tmp_path / "a.gpx", points))
+
+    def test_stated_zones_may_differ(self, tmp_path):
+        times = [
+            "2026-05-01T10:00:00+02:00",
+            "2026-05-01T08:00:01Z",
+            "2026-05-01T08:00:02",
+            "2026-05-01T09:00:03+01:00",
+        ]
+        points = [(50 + 20 * second / DEGREE_M, 10, time, "") for second, time in enumerate(times)]
+        assert read_own_speed(write_gpx(tmp_path / "a.gpx", points)).at([0, 3]) == pytest.approx(20, rel=1e-3)
 
     def test_positions_on_both_sides_of_a_gap_give_no_speed(self, tmp_path):
         """20 m/s; the receiver was off for 20 s, and for 60 s while the car stood."""

@@ -78,7 +78,9 @@ EVERY = search_option(
 )
 HORIZON = camera_option(None, "F", HORIZON_HELP)
 CAMERA = camera_option(
-    None, "NAME|FILE", "Lens: standard-58, wide-90, fisheye-120, fisheye-140 or fisheye-170; or a JSON file."
+    None,
+    "NAME|FILE",
+    "Lens: standard-58, wide-90, fisheye-120, fisheye-140 or fisheye-170; or a file (JSON; OpenCV, ROS).",
 )
 FIELD_OF_VIEW = camera_option(
     None, "DEG", "Field of view along the longer side in degrees, such as 90; default: 58, with a warning."

@@ -9,6 +9,7 @@ import logging
 import math
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -46,6 +47,8 @@ _UNUSUAL_SPEED = 70.0  # m/s, above which the unit is probably another one
 _MOVING, _MOVING_POINTS = 5.0, 5
 # Units in which stated speeds are found, in place of m/s: values for 1 m/s.
 _OTHER_UNITS = {"km/h": 3.6, "mph": 1 / 0.44704, "knots": 3600 / 1852}
+# A time with its zone; seconds by which neighbouring points differ from it, and degrees between them.
+_ZONE, _ZONE_TOLERANCE, _NEAR = re.compile(r"T.*(Z|[+-]\d\d:?\d\d)\s*$", re.IGNORECASE), 10.0, 0.01
 _OUTLYING = 366 * 86400.0  # s from the median time, such as the dates of a receiver without satellites
 # Factors from the columns of a table to m/s.
 _SPEED_COLUMNS = {"speed_mps": 1.0, "speed_kmh": 1 / 3.6, "speed_mph": 0.44704}
@@ -324,6 +327,26 @@ def _parse_time(text: str) -> float:
         return math.nan
 
 
+def _check_zones(points: Floats, texts: Sequence[str], name: str) -> None:
+    """Refuse times of two zones, in the order of the file: neighbouring places whole quarters of an hour apart.
+
+    So they are where a receiver finds its time zone, or where summer time ends.
+    """
+    known = np.flatnonzero(np.isfinite(points).all(axis=1, where=[True, False, True, True]))
+    steps = np.diff(points[known], axis=0)
+    quarters = steps[:, 0] / 900
+    zoned = np.array([_ZONE.search(texts[row]) is not None for row in known], np.bool_)
+    mixed = zoned[1:] != zoned[:-1]
+    whole = (np.round(quarters) != 0) & (np.abs(quarters - np.round(quarters)) * 900 < _ZONE_TOLERANCE)
+    wrong = whole & (mixed | ((quarters < 0) & (quarters > -60))) & (np.abs(steps[:, 2:]).max(axis=1) < _NEAR)
+    if wrong.any():
+        before, after = known[np.argmax(wrong) :][:2]
+        raise InvalidInputError(
+            f"path {name}: the time of point {after + 1}, {texts[after].strip()}, seems to have another time zone "
+            f"than {texts[before].strip()} before it; write all times in UTC"
+        )
+
+
 def _read_gpx(data: bytes, name: str) -> Floats:
     """Read the points of a GPX document, with times since 1970."""
     parser = ElementTree.XMLParser(target=_NoDoctype())
@@ -335,15 +358,19 @@ def _read_gpx(data: bytes, name: str) -> Floats:
     except InvalidInputError as error:
         raise InvalidInputError(f"path {name} is refused: {error}") from None
     # GPX 1.0 and 1.1 have different namespaces; the speed of version 1.1 is in an extension.
+    points = list(document.iterfind(".//{*}trkpt"))
+    times = [point.findtext(".//{*}time") or "" for point in points]
     rows = [
         (
-            _parse_time(point.findtext(".//{*}time") or ""),
+            _parse_time(time),
             _parse_float(point.findtext(".//{*}speed"), 0, 4 * _MAX_SPEED),
             *_position(point.get("lat"), point.get("lon")),
         )
-        for point in document.iterfind(".//{*}trkpt")
+        for point, time in zip(points, times, strict=True)
     ]
-    return np.array(rows).reshape(-1, 4)
+    found = np.array(rows).reshape(-1, 4)
+    _check_zones(found, times, name)
+    return found
 
 
 _RMC = re.compile(
