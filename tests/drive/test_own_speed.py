@@ -68,7 +68,7 @@ class TestGpx:
         for second in range(60):
             time = start + timedelta(seconds=second, hours=hours * (second >= 30))
             points.append((50 + 20 * second / DEGREE_M, 10, time.isoformat() + zones[second >= 30], ""))
-        with pytest.raises(InvalidInputError, match="point 31, .+ another time zone than .+ before it"):
+        with pytest.raises(InvalidInputError, match=r"point 31, .+ another time zone than .+ before it"):
             read_own_speed(write_gpx(tmp_path / "a.gpx", points))
 
     def test_stated_zones_may_differ(self, tmp_path):

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.helpers import StubDetector
 from tests.video.clips import gray_frames, write_clip
-from vehicle_detection import InvalidInputError, open_trip
+from vehicle_detection import InvalidInputError, open_trip, track
 from vehicle_detection.drive import find_trips, segment_clock
 from vehicle_detection.video import is_video_file
 
@@ -187,6 +188,40 @@ def test_trips_of_the_common_makers(tmp_path, form, starts, trips):
     assert [file for trip in found for file in trip.files] == list(lengths)
 
 
+@pytest.mark.parametrize("form", [form for form in MAKERS if not form.startswith("GH")])
+def test_generated_trips_of_the_common_makers(tmp_path, form):
+    """Files of any length with pauses of up to 2 s, gaps, overlaps and a last file that cannot be read."""
+    rng = np.random.default_rng(len(form))
+    dated = not form.startswith("GRMN")  # else overlaps are those of copies without their times
+    for folder in range(40):
+        begin, lengths, expected = datetime(2026, 1, 31, 8), {}, [[]]
+        count, broken = int(rng.integers(2, 12)), rng.random() < 0.3
+        for number in range(1, count + 1):
+            length = float(rng.integers(30, 301))
+            file = tmp_path / str(folder) / form.format(begin, number)
+            file.parent.mkdir(exist_ok=True)
+            file.touch()
+            end = begin.timestamp() + length
+            os.utime(file, (end, end))
+            lengths[file] = 0.0 if broken and number == count else length
+            expected[-1].append(file)
+            step = rng.choice(["follows", "follows", "gap", "overlap" if dated else "gap"])
+            pause = {
+                "follows": rng.integers(0, 3),
+                "gap": rng.integers(10, 3000),
+                "overlap": -rng.integers(4, 25),
+            }
+            begin += timedelta(seconds=length + int(pause[step]))
+            if step != "follows" and number < count:
+                expected.append([])
+        if not dated and broken and len(expected[-1]) == 1 and len(expected) > 1:
+            continue  # without a time or a length, whether it follows is unknown
+        found = find_trips(
+            rng.permutation(np.array(list(lengths), object)).tolist(), duration=lengths.__getitem__
+        )
+        assert [list(trip.files) for trip in found] == expected
+
+
 def test_cameras_kinds_of_recording_and_copies_in_low_resolution_are_told_apart():
     time, names = "20260131_081500", "NF NR NI NFS EF"
     assert len(find_trips([f"{time}_{name}.mp4" for name in names.split()])) == 5
@@ -291,3 +326,43 @@ def test_other_sources_are_those_of_open_source(card):
         assert source.info.frames == 8
     with pytest.raises(InvalidInputError, match="source must be"):
         open_trip(None)
+
+
+@pytest.mark.parametrize(
+    ("names", "breaks", "warning"),
+    [
+        (("20260131_081500_F.mp4", "20260131_081501_F.mp4"), set(), ""),
+        (("20260131_081500_F.mp4", "20260131_081600_F.mp4"), {8}, "59 s after the end of"),
+        (("20260131_081600_F.mp4", "20260131_081500_F.mp4"), {8}, "61 s before the end of"),
+        (("a.mp4", "b.mp4"), set(), ""),
+    ],
+)
+def test_tracks_end_at_gaps_between_files_of_a_list(card, names, breaks, warning, tmp_path, caplog):
+    files = [tmp_path / name for name in names]
+    for file in files:
+        file.write_bytes((card / "20260131_081500_F.mp4").read_bytes())
+    with open_trip(files) as source:
+        assert source.breaks == breaks
+        assert warning in caplog.text
+        assert bool(caplog.text) == bool(breaks)
+        detector = StubDetector()
+        cuts = []
+        follow = detector.track
+        detector.track = lambda found, **options: cuts.append(options["cut"]) or follow(found, **options)
+        assert len(list(track(source, detector, every=1))) == 16
+    assert {number for number, cut in enumerate(cuts) if cut} == breaks
+
+
+@pytest.mark.parametrize(
+    ("dates", "warned"),
+    [
+        (("20260131", "20260201"), False),
+        (("20990131",), True),
+        (("20000131",), True),
+        (("20150101", "20260131"), True),
+        (("20260101", "20260131"), False),
+    ],
+)
+def test_dates_of_a_clock_that_is_not_set_give_a_warning(dates, warned, caplog):
+    find_trips([f"{date}_081500_F.MP4" for date in dates], duration=lambda _: 60.0)
+    assert ("the clock of the camera seems to be wrong" in caplog.text) == warned

@@ -328,7 +328,7 @@ def _parse_time(text: str) -> float:
 
 
 def _check_zones(points: Floats, texts: Sequence[str], name: str) -> None:
-    """Refuse times of two zones, in the order of the file: neighbouring places whole quarters of an hour apart.
+    """Refuse times of two zones: neighbouring points of the file that are whole quarters of an hour apart.
 
     So they are where a receiver finds its time zone, or where summer time ends.
     """
@@ -342,8 +342,8 @@ def _check_zones(points: Floats, texts: Sequence[str], name: str) -> None:
     if wrong.any():
         before, after = known[np.argmax(wrong) :][:2]
         raise InvalidInputError(
-            f"path {name}: the time of point {after + 1}, {texts[after].strip()}, seems to have another time zone "
-            f"than {texts[before].strip()} before it; write all times in UTC"
+            f"path {name}: the time of point {after + 1}, {texts[after].strip()}, seems to have another time "
+            f"zone than {texts[before].strip()} before it; write all times in UTC"
         )
 
 

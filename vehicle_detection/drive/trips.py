@@ -17,7 +17,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
@@ -33,6 +33,9 @@ File = Path | str
 _TOLERANCE = 3.0
 # Maximum length of a segment in seconds, where its file cannot be probed.
 _MAX_SEGMENT = 660.0
+
+# Names with earlier years are those of cameras whose clock was not set.
+_FIRST_YEAR = 2009
 
 _TIME = re.compile(
     r"(?<!\d)(20\d{2})[-_.]?(\d{2})[-_.]?(\d{2})[-_. T]{0,3}(\d{2})[-_.h]?(\d{2})[-_.m]?(\d{2})(?!\d{6})"
@@ -136,6 +139,7 @@ def find_trips(files: Iterable[File], *, duration: Callable[[File], float] | Non
         # Folders named after cameras are told apart by their path already.
         key = (str(name.parent), segment.camera, segment.series, segment.start is not None)
         groups[key].append((segment, file))
+    _warn_of_dates([pair for members in groups.values() for pair in members])
     if duration is None:
         probed = [file for members in groups.values() if len(members) > 1 for _, file in members]
         with ThreadPoolExecutor(available_cores(), thread_name_prefix="vehicle-probe") as pool:
@@ -150,6 +154,18 @@ def find_trips(files: Iterable[File], *, duration: Callable[[File], float] | Non
     return trips
 
 
+def _warn_of_dates(members: Sequence[tuple[_Segment, File]]) -> None:
+    """Warn of dates in names that are those of a clock that was not set: in the future, or long ago."""
+    dated = [(segment.start, file) for segment, file in members if segment.start is not None]
+    latest = datetime.now() + timedelta(days=2)
+    last = max((start for start, _ in dated if start < latest), default=latest)
+    for start, file in dated:
+        reset = (start.month, start.day) == (1, 1) and last - start > timedelta(days=366)
+        if start > latest or start.year < _FIRST_YEAR or reset:
+            _LOGGER.warning("%s is dated %s: the clock of the camera seems to be wrong", file, start.date())
+            return
+
+
 def _probe_length(file: File) -> float:
     """Length of a video in seconds; 0 if it is unknown, as on storage from which it would be copied."""
     copied = is_url(str(file)) and not str(file).startswith(("http://", "https://"))
@@ -162,8 +178,9 @@ def _probe_length(file: File) -> float:
 def open_trip(source: Source, **options: Any) -> FrameSource:
     """Open the consecutive segments of a folder or pattern as one video, and any other source.
 
-    A folder or a pattern, such as ``"CARD/*F.MP4"``, must hold the segments of one trip; all frames have the
-    size and rate of the first one. Other options: see `open_source`.
+    A folder or a pattern, such as ``"CARD/*F.MP4"``, must hold the segments of one trip. Files of a list may
+    belong to several: tracks end at each gap, with a warning. All frames have the size and rate of the first
+    one. Other options: see `open_source`.
 
     Examples
     --------
@@ -182,7 +199,25 @@ def open_trip(source: Source, **options: Any) -> FrameSource:
                 f"select one with a pattern such as '{example}', or process all with vehicle-detection batch"
             )
         source = trips[0].files
-    return open_source(source, **options)
+    opened = open_source(source, **options)
+    if isinstance(source, (list, tuple)) and len(opened.files) > 1 and is_video_file(opened.files[0]):
+        _mark_gaps(opened)
+    return opened
+
+
+def _mark_gaps(source: FrameSource) -> None:
+    """Begin another scene where the names of two files state that one does not follow the other, and warn."""
+    starts = [_parse_name(_posix(file)).start for file in source.files]
+    for (begin, end), files, (first, second) in zip(
+        *map(itertools.pairwise, (source.segment_starts, source.files, starts))
+    ):
+        if first is None or second is None:
+            continue
+        gap = (second - first).total_seconds() - (end - begin)
+        if abs(gap) > _TOLERANCE:
+            source.breaks.add(round(end * source.info.fps))
+            place = f"{abs(gap):.0f} s {'after' if gap > 0 else 'before'} the end of {files[0]}"
+            _LOGGER.warning("%s begins %s; tracks end there", files[1], place)
 
 
 def _gap(trip: Trip) -> str:

@@ -238,7 +238,7 @@ class _Pipeline:
         for index, moment, frame in reader:
             if self.stopped:
                 break
-            cut = cuts.update(frame)
+            cut = cuts.update(frame) or index in self._plan.source.breaks
             skipped += 1
             dropped = index - expected if expected is not None else 0
             search = None

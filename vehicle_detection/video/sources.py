@@ -53,6 +53,7 @@ class FrameSource(Closing):
         self.name, self.info = name, info
         self.files = tuple(files)  # that are read, in order; empty for streams
         self.segment_starts: tuple[float, ...] = (0.0,)  # of the files of a trip, in seconds of the video
+        self.breaks: set[int] = set()  # frames that begin another scene, as after a gap between files
         self._states = {path: _state(path) for path in self.files if path.suffix not in IMAGE_SUFFIXES}
         self._on_close = contextlib.ExitStack()
 
