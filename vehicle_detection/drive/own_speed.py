@@ -335,7 +335,7 @@ def _check_zones(points: Floats, texts: Sequence[str], name: str) -> None:
     known = np.flatnonzero(np.isfinite(points).all(axis=1, where=[True, False, True, True]))
     steps = np.diff(points[known], axis=0)
     quarters = steps[:, 0] / 900
-    zoned = np.array([_ZONE.search(texts[row]) is not None for row in known], np.bool_)
+    zoned = np.array([_ZONE.search(texts[row]) is not None for row in known.tolist()], np.bool_)
     mixed = zoned[1:] != zoned[:-1]
     whole = (np.round(quarters) != 0) & (np.abs(quarters - np.round(quarters)) * 900 < _ZONE_TOLERANCE)
     wrong = whole & (mixed | ((quarters < 0) & (quarters > -60))) & (np.abs(steps[:, 2:]).max(axis=1) < _NEAR)
