@@ -1,12 +1,15 @@
 """The wheel and the source distribution: their files, and that two builds give the same bytes."""
 
 import os
+import re
 import shutil
 import subprocess
 import tarfile
+import tomllib
 import zipfile
 
 import pytest
+import yaml
 
 from tests.helpers import ROOT
 from vehicle_detection import __version__
@@ -82,3 +85,34 @@ def test_two_builds_give_the_same_bytes(kind, source, tmp_path, monkeypatch):
     )  # other dates and permissions
     with open(first, "rb") as one, open(build(kind, copy, tmp_path / "second"), "rb") as other:
         assert one.read() == other.read()
+
+
+CONDA_NAMES = {"opencv-python-headless": "py-opencv", "matplotlib": "matplotlib-base", "PyYAML": "pyyaml"}
+
+
+def test_the_conda_recipe_requires_what_the_package_requires():
+    recipe = yaml.safe_load((ROOT / "conda/recipe.yaml").read_text())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    pairs = [re.match(r"([\w-]+)(.*)", each).groups() for each in project["dependencies"]]
+    expected = {f"{CONDA_NAMES.get(name, name)} {version}" for name, version in pairs}
+    assert set(recipe["requirements"]["run"]) == expected | {"python >=${{ python_min }}"}
+    assert recipe["context"]["version"] == __version__
+
+
+def test_the_workflows_test_the_stated_pythons_and_files_that_exist():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    stated = {each.split()[-1] for each in project["classifiers"] if ":: 3." in each}
+    jobs = yaml.safe_load((ROOT / ".github/workflows/tests.yml").read_text())["jobs"]
+    assert stated == set(jobs["all"]["strategy"]["matrix"]["python"])
+    paths = [
+        word for step in jobs["core"]["steps"] for word in step.get("run", "").split() if "tests/" in word
+    ]
+    assert paths
+    assert all((ROOT / path).exists() for path in paths)
+
+
+@pytest.mark.parametrize(
+    "name", [".github/workflows/release.yml", ".readthedocs.yaml", ".pre-commit-config.yaml"]
+)
+def test_settings_of_services_can_be_read(name):
+    assert isinstance(yaml.safe_load((ROOT / name).read_text()), dict)

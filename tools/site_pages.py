@@ -36,7 +36,7 @@ README_SECTIONS = ("Start", "Your own video", "In a notebook")
 
 # Pages of the API reference: name, title, and modules of the package whose public names they describe.
 API_PAGES = (
-    ("detect", "Detect and track", "detector tracking boxes camera function_model"),
+    ("detect", "Detect and track", "detector results tracking boxes camera function_model"),
     ("video", "Video and drawing", "video annotator drawing images"),
     ("drive", "Events, reports and batches", "drive"),
     ("tables", "Tables and files", "tables formats"),

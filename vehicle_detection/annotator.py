@@ -503,6 +503,12 @@ def draw_tracks(
     Only tracks with ``track.shown`` are drawn; those without a detection in this frame have dashed boxes.
     Labels are placed where they hide neither other labels nor other vehicles, if necessary on leader lines or
     without their last fields. In a video, an `Annotator` also keeps each label in its place.
+
+    >>> from vehicle_detection import Detections, Tracker
+    >>> road = np.zeros((720, 1280, 3), np.uint8)
+    >>> tracks = Tracker().update(Detections([[600, 400, 700, 480]], [2.0]), road.shape)
+    >>> draw_tracks(road, tracks, labels=["id"])[400, 650].tolist(), road[400, 650].tolist()
+    ([230, 159, 0], [0, 0, 0])
     """
     style = DrawParams(labels=labels, line_width=line_width, color_by=color_by)
     return Annotator(style).draw_tracks(image, tracks)
@@ -567,6 +573,10 @@ def draw_diagnostics(
 
     `windows` are boxes as in `draw_boxes`; `heat` holds ``(h, w)`` finite numbers, of the frame's size or
     smaller, drawn from black (0) to yellow (maximum); `params` says how tracks are drawn.
+
+    >>> road, windows = np.zeros((720, 1280, 3), np.uint8), [[600, 400, 700, 480]]
+    >>> draw_diagnostics(road, windows, np.zeros((90, 160)), []).shape
+    (720, 1280, 3)
     """
     if params is not None:
         check_type(params, "params", DrawParams, "omit it for the defaults")

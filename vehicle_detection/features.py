@@ -337,6 +337,9 @@ def hog_image(
     """Visualize the orientation histogram of each cell as a star of lines: ``(H, W)`` float64.
 
     The parameters are those of `get_hog_features`.
+
+    >>> hog_image(255 * np.eye(64, dtype=np.uint8)).shape
+    (64, 64)
     """
     from skimage.feature import hog
 

@@ -70,6 +70,11 @@ class HeatParams(Checked):
     peak_fraction
         A region is reduced to the part around its peak that has at least this fraction of the peak's heat,
         in [0, 1); 0 keeps whole regions, as in the course.
+
+    Examples
+    --------
+    >>> HeatParams(weighting="count", threshold=8.0).frames
+    5
     """
 
     weighting: Literal["score", "count"] = choice("score", ("score", "count"))

@@ -192,6 +192,12 @@ def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
     """Write an ``(H, W, 3)`` uint8 RGB image to a file, in the format of its suffix, such as ``.png``.
 
     The file is written atomically: after an error, an existing file is unchanged.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     write_image(f"{folder}/black.png", np.zeros((4, 6, 3), np.uint8))
+    ...     read_image(f"{folder}/black.png").shape
+    (4, 6, 3)
     """
     rgb = check_image(image)
     check_path(path)

@@ -46,6 +46,11 @@ class RegionParams(Checked):
     flank_peak_ratio
         A group whose face lies on the visible side of another vehicle is dropped even if it is the better
         one, unless the other peak is at most this fraction of its own.
+
+    Examples
+    --------
+    >>> RegionParams(min_peak=1.5).min_peak
+    1.5
     """
 
     min_peak: float = number(0.7, low=0, high=1e9)

@@ -98,6 +98,11 @@ class SearchBand(Checked):
     y, x
         Top and bottom of the band relative to the horizon, positive downwards; left and right end as
         fractions of the frame's width, 0-1.
+
+    Examples
+    --------
+    >>> SearchBand(window=(96, 96), y=(-16, 128), overlap=(0.75, 0.75)).x
+    (0.0, 1.0)
     """
 
     window: tuple[float, float] = checked_field(MISSING, _pair(low=8, high=4096))
@@ -262,6 +267,13 @@ class SearchResult:
         are kept for tracking only.
     shape, seconds
         ``(height, width)`` of the frame, and the duration of the search.
+
+    Examples
+    --------
+    >>> from vehicle_detection import Detector, read_image
+    >>> found = Detector("highway").search(read_image("test_images/road1.jpg"))
+    >>> found.shape, found.vehicles  # the boxes are derived from the windows
+    ((720, 1280), None)
     """
 
     windows: Detections

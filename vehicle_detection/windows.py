@@ -110,6 +110,13 @@ def search_windows(
         As in `find_cars`.
     min_score
         Minimum score of the returned windows (exclusive); None returns all.
+
+    Examples
+    --------
+    >>> from vehicle_detection import load_classifier, read_image
+    >>> image, classifier = read_image("test_images/road1.jpg"), load_classifier()
+    >>> len(search_windows(image, [[600, 400, 664, 464]], classifier, min_score=None))  # with its score
+    1
     """
     check_image(image)
     check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)

@@ -19,7 +19,12 @@ from vehicle_detection.images import read_image
 
 @dataclass(frozen=True)
 class FrameSet:
-    """Image files of a folder, each read on access; iterating yields ``(name, image)``."""
+    """Image files of a folder, each read on access; iterating yields ``(name, image)``.
+
+    >>> frames = load_frames("test_images")
+    >>> len(frames), frames.names[0], frames[0].shape
+    (6, 'road1.jpg', (720, 1280, 3))
+    """
 
     folder: Path
     names: tuple[str, ...]  # in natural order

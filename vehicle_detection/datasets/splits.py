@@ -36,6 +36,10 @@ class Split:
 
     Both parts are ``(N,)`` intp, not empty, and share no row; anything else raises an `InvalidInputError`.
     Functions return all rows (`split_sources`: those of its sources), ascending in each part.
+
+    >>> train, test = Split([0, 2], [1])
+    >>> train
+    array([0, 2])
     """
 
     train: NDArray[np.intp]

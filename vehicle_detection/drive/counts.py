@@ -33,7 +33,12 @@ class MinuteCounts:
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleCounts:
-    """Counts of a drive."""
+    """Counts of a drive.
+
+    >>> counts = count_vehicles([], TrackTable(), fps=25)
+    >>> counts.vehicles, counts.total.met
+    (0, 0)
+    """
 
     vehicles: int  # number of different tracks
     total: MinuteCounts  # of the whole drive

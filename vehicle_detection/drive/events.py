@@ -128,6 +128,12 @@ class Event:
         Speed of the vehicle over ground in the camera's direction, negative when oncoming: own speed minus
         `closing_mps`, where both are known. For ``"overtook_us"`` both are those of the first frame in which
         it certainly moves away.
+
+    Examples
+    --------
+    >>> event = Event(kind="met", track_id=1, frame=50, start_frame=40, end_frame=50, time_s=2.0, side="left")
+    >>> event.distance_m is None, event.is_bound
+    (True, False)
     """
 
     kind: Kind

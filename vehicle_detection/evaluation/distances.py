@@ -61,6 +61,12 @@ class DistanceScores(Scores):
         that it cuts are ``"cut, 0-5 m"`` and so on.
     speeds, collision_times
         Relative speeds, and times to collision (distance over closing speed) that truly are 1 to 15 s.
+
+    Examples
+    --------
+    >>> boxes = TrackTable([0], [1], [[10, 10, 60, 50]], distance_m=[15.0], distance_std_m=[1.0])
+    >>> evaluate_distances(boxes, boxes).distances["10-20 m"].within_2_std
+    1.0
     """
 
     distances: dict[str, ErrorScores]

@@ -21,7 +21,12 @@ from vehicle_detection.tables import NO_TRACK, FrameKey, TrackTable
 
 @dataclass(frozen=True)
 class TrackScores(Scores):
-    """Result of `evaluate_tracks`: counts of boxes are summed over the frames, as in `DetectionScores`."""
+    """Result of `evaluate_tracks`: counts of boxes are summed over the frames, as in `DetectionScores`.
+
+    >>> boxes = TrackTable([0, 1], [1, 1], [[0, 0, 50, 40], [4, 0, 54, 40]])
+    >>> evaluate_tracks(boxes, boxes).hota
+    1.0
+    """
 
     frames: int  #: number of evaluated frames
     iou: float  #: smallest IoU of a match

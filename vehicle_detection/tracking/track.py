@@ -127,6 +127,13 @@ class Track:
     distance_m, distance_std_m, speed_mps, speed_std_mps
         Distance along the road in meters, and speed relative to the camera in meters per second, positive
         when moving away, with their standard errors; None where they are unknown.
+
+    Examples
+    --------
+    >>> from vehicle_detection import Detections, Tracker
+    >>> (track,) = Tracker().update(Detections([[600, 400, 700, 480]], [2.0]), (720, 1280))
+    >>> track.id, track.state, track.shown
+    (1, 'confirmed', True)
     """
 
     id: int
@@ -164,6 +171,12 @@ class FrameResult:
         interpolated or predicted.
     frame
         The ``(H, W, 3)`` uint8 RGB frame, if `track` was asked for frames; otherwise None.
+
+    Examples
+    --------
+    >>> from vehicle_detection import VehicleDetector, read_image
+    >>> VehicleDetector("highway").process(read_image("test_images/road1.jpg"), time=0.0)
+    FrameResult(0 at 0.00 s: 2 detections, 2 vehicles shown)
     """
 
     index: int

@@ -309,6 +309,10 @@ class TrackRun(Closing):
 
     Closing or deleting it ends all processes and threads; nothing is started before the first result. `info`
     holds the properties of the source's video, and `has_frames` says whether the results hold their frames.
+
+    >>> with track("test_images/*.jpg", "highway", end=0.08) as run:
+    ...     print(run.info.shape, [len(result.detections) for result in run])
+    (720, 1280, 3) [2, 4]
     """
 
     def __init__(
