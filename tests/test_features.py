@@ -16,13 +16,9 @@ from vehicle_detection.features import (
     HOG_CHANNELS,
     SPATIAL_ORDERS,
     FeatureParams,
-    bin_spatial,
-    color_hist,
     convert_color,
     extract_features,
-    get_hog_features,
     hog_blocks,
-    hog_image,
     single_img_features,
 )
 from vehicle_detection.images import decode_image, write_image
@@ -254,53 +250,6 @@ def test_one_edge_fills_one_orientation():
     assert np.count_nonzero(by_orientation) == 1
     horizontal = hog_blocks(vertical.T, 9, 8, 2).sum(axis=(0, 1, 2, 3))
     assert horizontal.argmax() == 4
-
-
-@pytest.mark.parametrize("function", [get_hog_features, hog_image])
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"img": BLANK}, r"img must be one \(H, W\) uint8 channel"),
-        ({"pix_per_cell": 0}, "pix_per_cell must be an integer at least 1"),
-        ({"pix_per_cell": 65}, "img must have at least the size of a block"),
-    ],
-)
-def test_invalid_arguments_of_hog(function, arguments, message):
-    with pytest.raises(InvalidInputError, match=message):
-        function(**{"img": BLANK[..., 0], **arguments})
-
-
-def test_the_smallest_image_for_hog():
-    assert hog_blocks(np.zeros((50, 70), np.uint8), 6, 8, 3).shape == (4, 6, 3, 3, 6)
-    assert get_hog_features(np.zeros((24, 24), np.uint8), 9, 8, 3).shape == (81,)
-    with pytest.raises(InvalidInputError, match=r"at least the size of a block \(24x24 pixels\); got 24x23"):
-        get_hog_features(np.zeros((23, 24), np.uint8), 9, 8, 3)
-    with pytest.raises(InvalidInputError, match="cell_per_block must be an integer at least 1"):
-        hog_blocks(BLANK[..., 0], 9, 8, 0)
-
-
-def test_bin_spatial_is_ordered_by_channel():
-    image = np.zeros((64, 64, 3), np.uint8)
-    image[..., 1] = 7
-    assert bin_spatial(image, 2).tolist() == [0] * 4 + [7] * 4 + [0] * 4
-    np.testing.assert_array_equal(bin_spatial(PATCHES[0], 64), PATCHES[0].transpose(2, 0, 1).ravel())
-    np.testing.assert_array_equal(bin_spatial(PATCHES[0], (32, 32)), bin_spatial(PATCHES[0]))
-    np.testing.assert_array_equal(bin_spatial(PATCHES[0], np.int64(32)), bin_spatial(PATCHES[0]))
-    assert bin_spatial(PATCHES[0], (4, 2)).shape == (24,)
-
-
-def test_color_hist_counts_all_pixels():
-    counts = color_hist(PATCHES[0], 10)
-    assert counts.shape == (30,)
-    assert counts.dtype.kind == "i"
-    assert counts.reshape(3, 10).sum(axis=1).tolist() == [64 * 64] * 3
-    assert color_hist(PATCHES[0]).shape == (96,)
-    image = np.array([[[0, 127, 255]]], np.uint8)
-    assert color_hist(image, 2).tolist() == [1, 0, 1, 0, 0, 1]
-    with pytest.raises(InvalidInputError, match="nbins must be an integer from 1 to 256"):
-        color_hist(image, 0)
-    with pytest.raises(InvalidInputError, match="img must be an"):
-        color_hist(image / 255)
 
 
 @pytest.mark.parametrize("color_space", COLOR_SPACES)

@@ -5,7 +5,7 @@ from .camera import Camera, open_camera, read_camera, write_camera
 from .course import HeatmapDetector
 from .datasets import FrameSet, PatchSet, fetch_patches, load_frames, load_patches, load_training_patches
 from .detector import Detector, VehicleDetector, detect, load_model
-from .drawing import blur_boxes, draw_boxes, draw_detections, draw_labeled_bboxes
+from .drawing import blur_boxes, draw_boxes, draw_detections
 from .drive import (
     ReportWriter,
     count_vehicles,
@@ -29,12 +29,8 @@ from .errors import (
 from .evaluation import LabelledFrames, evaluate_detections, evaluate_tracks, explain
 from .features import (
     FeatureParams,
-    bin_spatial,
-    color_hist,
     convert_color,
     extract_features,
-    get_hog_features,
-    hog_image,
     single_img_features,
 )
 from .formats import open_tracks, read_labels, write_labels, write_tracks
@@ -106,11 +102,9 @@ __all__ = [
     "add_heat",
     "annotate_clip",
     "apply_threshold",
-    "bin_spatial",
     "blur_boxes",
     "bounding_boxes",
     "clip_boxes",
-    "color_hist",
     "convert_color",
     "count_vehicles",
     "course",
@@ -120,7 +114,6 @@ __all__ = [
     "draw_boxes",
     "draw_detections",
     "draw_diagnostics",
-    "draw_labeled_bboxes",
     "draw_tracks",
     "drive",
     "estimate_horizon",
@@ -133,8 +126,6 @@ __all__ = [
     "find_cars",
     "find_events",
     "find_vehicles",
-    "get_hog_features",
-    "hog_image",
     "iou_matrix",
     "label_boxes",
     "load_classifier",

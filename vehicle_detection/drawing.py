@@ -405,39 +405,6 @@ def score_texts(detections: Detections) -> list[str]:
     return [f"{score:.2f}" for score in detections.scores] if known is None else [f"{p:.0%}" for p in known]
 
 
-def draw_labeled_bboxes(image: Image, labels: tuple[NDArray[Any], int]) -> Image:
-    """Draw the bounding box of each labeled region on a copy of an image, as the course does.
-
-    `labels` are the label array ``(H, W)`` and the number of regions, what ``scipy.ndimage.label`` returns.
-
-    Examples
-    --------
-    >>> from scipy import ndimage
-    >>> heat = np.zeros((40, 60))
-    >>> heat[10:30, 20:50] = 1
-    >>> drawn = draw_labeled_bboxes(np.zeros((40, 60, 3), np.uint8), ndimage.label(heat))
-    >>> np.argwhere(drawn.any(axis=2)).min(axis=0).tolist()
-    [10, 20]
-    """
-    given: Any = labels
-    if not isinstance(given, tuple) or len(given) != 2 or not isinstance(given[0], np.ndarray):
-        raise InvalidInputError(
-            f"labels must be the pair (label array, number of regions), got {describe(labels)}; "
-            "pass what scipy.ndimage.label returns"
-        )
-    array, count = labels[0], check_integer(labels[1], "labels[1]", low=0)
-    shape = check_image(image).shape[:2]
-    if array.shape != shape or array.dtype.kind not in "iu":
-        raise InvalidInputError(
-            f"labels[0] must be integers of the image's shape {shape}, got {describe(array)}; "
-            "label the heat map of this image"
-        )
-    from scipy.ndimage import find_objects
-
-    regions = [region for region in find_objects(array, max_label=count) if region is not None]
-    return draw_boxes(image, [[x.start, y.start, x.stop, y.stop] for y, x in regions])
-
-
 def draw_detections(
     image: Image,
     detections: Detections,

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from vehicle_detection import _kernels as kernels
 from vehicle_detection._common import (
     Checked,
-    check_bool,
-    check_channel,
     check_choice,
     check_image,
     check_integer,
@@ -280,123 +278,16 @@ def hog_source(
 def hog_blocks(
     img: NDArray[np.uint8], orient: int, pix_per_cell: int, cell_per_block: int, transform_sqrt: bool = False
 ) -> NDArray[np.float64]:
-    """HOG of one channel: ``(block rows, block columns, cell rows, cell columns, orient)`` float64."""
+    """HOG of one channel by scikit-image with L2-Hys normalization.
+
+    Returns ``(block rows, block columns, cell rows, cell columns, orient)`` float64. Dalal and Triggs,
+    "Histograms of oriented gradients for human detection" (CVPR 2005).
+    """
     from skimage.feature import hog
 
-    _check_hog(img, orient, pix_per_cell, cell_per_block)
-    transform_sqrt = check_bool(transform_sqrt, "transform_sqrt")
     cell, block = (pix_per_cell, pix_per_cell), (cell_per_block, cell_per_block)
     blocks = hog(img, orient, cell, block, "L2-Hys", transform_sqrt=transform_sqrt, feature_vector=False)
     return np.asarray(blocks, np.float64)
-
-
-def _check_hog(img: NDArray[np.uint8], orient: int, pix_per_cell: int, cell_per_block: int) -> None:
-    check_channel(img)
-    check_integer(orient, "orient", low=1)
-    side = check_integer(pix_per_cell, "pix_per_cell", low=1)
-    side *= check_integer(cell_per_block, "cell_per_block", low=1)
-    height, width = img.shape
-    if min(height, width) < side:
-        raise InvalidInputError(
-            f"img must have at least the size of a block ({side}x{side} pixels); got {width}x{height}"
-        )
-
-
-def get_hog_features(
-    img: NDArray[np.uint8],
-    orient: int = 9,
-    pix_per_cell: int = 8,
-    cell_per_block: int = 2,
-    *,
-    transform_sqrt: bool = False,
-) -> NDArray[np.float64]:
-    """Histogram of oriented gradients (HOG) of one channel, by scikit-image with L2-Hys normalization.
-
-    Dalal and Triggs, "Histograms of oriented gradients for human detection" (CVPR 2005).
-
-    Returns 1-D float64 in [0, 1], in the order block row, block column, cell row, cell column, orientation.
-
-    Parameters
-    ----------
-    img
-        ``(H, W)`` uint8, one channel.
-    orient, pix_per_cell, cell_per_block, transform_sqrt
-        As in `FeatureParams`.
-
-    Examples
-    --------
-    >>> get_hog_features(np.zeros((64, 64), np.uint8)).shape
-    (1764,)
-    """
-    return hog_blocks(img, orient, pix_per_cell, cell_per_block, transform_sqrt).ravel()
-
-
-def hog_image(
-    img: NDArray[np.uint8], orient: int = 9, pix_per_cell: int = 8, *, transform_sqrt: bool = False
-) -> NDArray[np.float64]:
-    """Visualize the orientation histogram of each cell as a star of lines: ``(H, W)`` float64.
-
-    The parameters are those of `get_hog_features`.
-
-    >>> hog_image(255 * np.eye(64, dtype=np.uint8)).shape
-    (64, 64)
-    """
-    from skimage.feature import hog
-
-    _check_hog(img, orient, pix_per_cell, 1)
-    transform_sqrt = check_bool(transform_sqrt, "transform_sqrt")
-    cell = (pix_per_cell, pix_per_cell)
-    _, picture = hog(img, orient, cell, (1, 1), transform_sqrt=transform_sqrt, visualize=True)
-    return np.asarray(picture, np.float64)
-
-
-def bin_spatial(
-    img: NDArray[np.uint8],
-    size: int | tuple[int, int] = (32, 32),
-    *,
-    order: Literal["channels", "interleaved"] = "channels",
-) -> NDArray[np.uint8]:
-    """Pixel values of a downscaled image: ``(width * height * 3,)`` uint8.
-
-    Parameters
-    ----------
-    img, size
-        ``(H, W, 3)`` uint8 in any color space, and width and height to scale to, or an integer for both.
-    order
-        ``"channels"``: one channel after the other; ``"interleaved"``: pixel by pixel.
-
-    Examples
-    --------
-    >>> bin_spatial(np.zeros((64, 64, 3), np.uint8), 16).shape
-    (768,)
-    """
-    check_image(img, "img")
-    pair = size if isinstance(size, tuple) else (size, size)
-    if len(pair) != 2:
-        raise InvalidInputError(f"size must be an integer or (width, height); got {describe(size)}")
-    width, height = (check_integer(side, "size", low=1) for side in pair)
-    check_choice(order, "order", SPATIAL_ORDERS)
-    small = np.asarray(cv2.resize(img, (width, height)), np.uint8)
-    return (small if order == "interleaved" else small.transpose(2, 0, 1)).ravel()
-
-
-def color_hist(img: NDArray[np.uint8], nbins: int = 32) -> NDArray[np.int64]:
-    """Concatenated histograms of the channels over 0-255: ``(3 * nbins,)`` int64 counts.
-
-    Parameters
-    ----------
-    img, nbins
-        ``(H, W, 3)`` uint8 in any color space, and the number of bins of each channel.
-
-    Examples
-    --------
-    >>> color_hist(np.zeros((2, 2, 3), np.uint8), 2).tolist()
-    [4, 0, 4, 0, 4, 0]
-    """
-    check_image(img, "img")
-    check_integer(nbins, "nbins", low=1, high=256)
-    channels = [np.histogram(img[..., c], bins=nbins, range=(0, 256))[0] for c in range(3)]
-    return np.concatenate(channels)
 
 
 def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None = None) -> NDArray[np.float64]:
@@ -422,7 +313,7 @@ def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None =
         source = hog_source(image, params)
         orient, block, root = params.orient, params.cell_per_block, params.transform_sqrt
         parts += [
-            get_hog_features(channel, orient, side, block, transform_sqrt=root)
+            hog_blocks(channel, orient, side, block, root).ravel()
             for side in (params.pix_per_cell, 2 * params.pix_per_cell)[: 1 + params.coarse_hog]
             for channel in np.moveaxis(source, -1, 0)
         ]
@@ -435,9 +326,11 @@ def color_parts(
     """Spatial bins and histogram of a patch in their color spaces, where they are used."""
     parts: list[NDArray[Any]] = []
     if params.spatial_feat:
-        parts.append(bin_spatial(spatial, params.spatial_size, order=params.spatial_order))
+        bins = cv2.resize(spatial, (params.spatial_size,) * 2)
+        parts.append((bins if params.spatial_order == "interleaved" else bins.transpose(2, 0, 1)).ravel())
     if params.hist_feat:
-        counts = color_hist(hist, params.hist_bins)
+        planes = np.moveaxis(hist, -1, 0)
+        counts = np.concatenate([np.histogram(each, params.hist_bins, (0, 256))[0] for each in planes])
         parts.append(np.sqrt(counts) if params.hist_sqrt else counts)
     return parts
 

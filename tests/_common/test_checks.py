@@ -13,7 +13,6 @@ from vehicle_detection._common import (
     check_array,
     check_bool,
     check_boxes,
-    check_channel,
     check_choice,
     check_image,
     check_integer,
@@ -73,7 +72,6 @@ def test_arrays_that_fit_are_returned():
     boxes = np.array([[0, 1, 2, 3], [5, 5, 5, 5]], np.int16)
     batch = np.stack([PATCH, PATCH + 1])
     assert check_image(IMAGE) is IMAGE
-    assert check_channel(IMAGE[..., 0]).shape == (4, 6)
     assert check_boxes(boxes) is boxes
     assert check_boxes([[0.5, 1, 2, 3]]).dtype == np.float64
     assert check_patches(batch, 64) is batch
@@ -109,12 +107,6 @@ def test_arrays_that_fit_are_returned():
 def test_check_image_explains_the_conversion(image, remedy):
     with pytest.raises(InvalidInputError, match=rf"^frame must be an \(H, W, 3\) uint8 RGB array.*{remedy}"):
         check_image(image, "frame")
-
-
-@pytest.mark.parametrize("channel", [IMAGE, IMAGE[..., 0].astype(float), np.zeros((0, 3), np.uint8), "r"])
-def test_check_channel_refuses(channel):
-    with pytest.raises(InvalidInputError, match=r"^img must be one \(H, W\) uint8 channel, got .* pick a"):
-        check_channel(channel)
 
 
 def test_check_patches_stacks_a_list():

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import ndimage
 
 from tests.drawing.cases import blank, changed_box
 from vehicle_detection.boxes import Detections
@@ -18,7 +17,6 @@ from vehicle_detection.drawing import (
     draw_boxes,
     draw_cell_shares,
     draw_detections,
-    draw_labeled_bboxes,
 )
 from vehicle_detection.errors import InvalidInputError
 
@@ -54,16 +52,6 @@ class TestBoxes:
         assert drawn.shape == image.shape
         colors = {tuple(pixel) for pixel in drawn.reshape(-1, 3).tolist()}
         assert colors <= {(90, 90, 90), (0, 0, 255)}
-
-
-class TestRegions:
-    def test_each_region_gets_its_bounding_box(self):
-        heat = np.zeros((100, 200))
-        heat[20:40, 30:80] = heat[60:90, 120:190] = 2
-        image = blank(100, 200, 0)
-        drawn = draw_labeled_bboxes(image, ndimage.label(heat))
-        np.testing.assert_array_equal(drawn, draw_boxes(image, [[30, 20, 80, 40], [120, 60, 190, 90]]))
-        assert not image.any()
 
 
 class TestDetections:
@@ -271,11 +259,6 @@ FOUND = Detections([[600, 400, 700, 490]], [1.25])
         (lambda: draw_boxes(np.zeros((5, 5, 3)), []), r"image must be an \(H, W, 3\) uint8 RGB array"),
         (lambda: draw_boxes(blank(), [], color="blue"), r"color must be \(red, green, blue\), 0-255 each"),
         (lambda: draw_boxes(blank(), [], color=(0, 0, 256)), "color must be an integer from 0 to 255"),
-        (lambda: draw_labeled_bboxes(blank(), np.zeros((720, 1280), int)), "scipy.ndimage.label returns"),
-        *(
-            (lambda labels=labels: draw_labeled_bboxes(blank(), (labels, 0)), r"labels\[0\] must be integers")
-            for labels in (np.zeros((9, 9), int), np.zeros((720, 1280)))
-        ),
         (lambda: blur_boxes(NOISE, [], region="faces"), "region must be one of 'vehicles', 'plates'"),
     ],
 )

@@ -78,7 +78,7 @@ def test_a_worker_that_dies_at_its_start_leaves_nothing(initializer, error, mess
     resource_tracker.ensure_running()
     before = open_files(), child_processes()
     pool = WorkerPool(1, (initializer, ()))
-    calls = [pool.submit(process_id) for _ in range(3)]
+    calls = [pool.submit(process_id) for _ in range(2)]
     for call in calls:
         with pytest.raises(error, match=message):
             call.result(300)

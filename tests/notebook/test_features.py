@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
+from skimage.feature import hog
 
 from tests.helpers import random_classifier, rendered_patches
 from tests.notebook.helpers import SMALL, legend, texts, titles
 from vehicle_detection import notebook
-from vehicle_detection.features import FeatureParams, extract_features, hog_image
+from vehicle_detection.features import FeatureParams, extract_features
 from vehicle_detection.notebook.style import OTHER, VEHICLE
 from vehicle_detection.svm import Template, VehicleClassifier
 
@@ -76,7 +77,7 @@ def test_a_glyph_is_parallel_to_the_edge(ahead, slope):
     expected = expected / np.linalg.norm(expected)
     assert abs(along @ expected) == pytest.approx(1, abs=0.02)
     # the brightest pixels of scikit-image's rendering are on the same line
-    picture = hog_image(image[..., 0], 18, 16)
+    _, picture = hog(image[..., 0], 18, (16, 16), (1, 1), visualize=True)
     y, x = np.nonzero(picture[16:48, 16:48] > 0.8 * picture.max())
     if ahead[0] and ahead[1]:
         assert np.sign(np.corrcoef(x, y)[0, 1]) == np.sign(along[0] * along[1])

@@ -7,7 +7,6 @@ from vehicle_detection._common.checks import (
     check_array,
     check_bool,
     check_boxes,
-    check_channel,
     check_choice,
     check_flags,
     check_image,

@@ -130,15 +130,6 @@ def _conversion_to_uint8(values: NDArray[Any], name: str) -> str:
     return f"convert it with {name}.astype(numpy.uint8) once its values lie in 0-255"
 
 
-def check_channel(channel: object) -> NDArray[np.uint8]:
-    """Return the argument `img` if it is ``(H, W)`` uint8."""
-    if isinstance(channel, np.ndarray) and channel.ndim == 2 and channel.dtype == np.uint8 and channel.size:
-        return channel
-    raise InvalidInputError(
-        f"img must be one (H, W) uint8 channel, got {describe(channel)}; pick a channel with image[..., 0]"
-    )
-
-
 def check_patches(patches: object, size: int, name: str = "patches") -> NDArray[np.uint8]:
     """Return `patches` as an ``(N, size, size, 3)`` uint8 array; a list of such images is stacked."""
     patches = getattr(patches, "patches", patches)  # of a PatchSet

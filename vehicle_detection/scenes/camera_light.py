@@ -161,7 +161,7 @@ class SceneView(Checked):
     rain: float = number(0.0, low=0, high=1)  # 0 (dry) to 1 (heavy): streaks, haze, less contrast, more noise
     jpeg_quality: int | None = integer(None, low=1, high=100)
 
-    def configure(self, rng: Rng, margin: int = 0) -> SceneConfig:
+    def configure(self, rng: Rng) -> SceneConfig:
         """Return the configuration with an exact camera, and a random sun and seed."""
         height, width = self.shape
         focal_px = 0.9 * max(self.shape)
@@ -173,7 +173,7 @@ class SceneView(Checked):
         )  # fmt: skip
         seed = int(rng.integers(2**62))
         light = make_light(self.light, self.rain, np.random.default_rng([seed, 4]))
-        return SceneConfig(self.shape, camera, light, self.rain, self.jpeg_quality, margin, seed)
+        return SceneConfig(self.shape, camera, light, self.rain, self.jpeg_quality, seed=seed)
 
 
 def _tone_curve() -> NDArray[np.uint8]:

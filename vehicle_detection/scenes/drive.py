@@ -260,7 +260,6 @@ def render_drive(
     frames: int = 250,
     fps: float = 25.0,
     scenario: str = "highway",
-    pitch_jitter_px: int = 0,
     rough: bool = False,
     random_state: RandomState = 0,
     **view: Any,
@@ -279,12 +278,10 @@ def render_drive(
         oncoming. ``"passing"``: vehicles that the camera overtakes in one lane, and that overtake it in
         another. ``"closing"``: the distance to the vehicle ahead shrinks fast, and grows again.
         ``"cut_in"``: a car moves into the lane of the camera. ``"empty"``: no vehicles.
-    pitch_jitter_px
-        Largest number of rows by which the pitch of the camera moves the horizon up or down.
     rough
         Whether vehicles are 1.5 to 2.6 m wide, with trucks among them, the camera rolls by up to a degree,
-        and pitches by up to 0.3 degrees without `pitch_jitter_px`, and the vehicles follow crests and dips
-        of a radius of 4 km; the surface of the road is drawn level.
+        and pitches by up to 0.3 degrees, and the vehicles follow crests and dips of a radius of 4 km; the
+        surface of the road is drawn level.
     random_state, **view
         As for `render_scene`.
 
@@ -298,13 +295,11 @@ def render_drive(
     frames = check_integer(frames, "frames", low=1)
     fps = check_number(fps, "fps", low=1.0, high=1000.0)
     check_choice(scenario, "scenario", SCENARIOS)
-    margin = check_integer(pitch_jitter_px, "pitch_jitter_px", low=0, high=50)
     rough = check_bool(rough, "rough")
-    config = SceneView(**view).configure(rng, margin)
+    config = SceneView(**view).configure(rng)
     road, traffic = make_traffic(scenario, frames / fps, rng)
     if rough:
-        margin = margin or math.ceil(_PITCH * config.camera.focal_px)
-        config = replace(config, margin=margin)
+        config = replace(config, margin=math.ceil(_PITCH * config.camera.focal_px))
         traffic = [_vary(vehicle, rng) for vehicle in traffic]
     return Drive(config, road, traffic, frames=frames, fps=fps, rough=rough)
 
