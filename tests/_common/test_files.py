@@ -251,7 +251,10 @@ def run_interrupted(function, number):
 
 
 def interrupt_everywhere(place):
-    """Interrupt the writing of a file and the use of a folder at each instruction; return their numbers."""
+    """Interrupt the writing of a file and the use of a folder at every third instruction.
+
+    Returns the numbers of their instructions.
+    """
 
     def write():
         with atomic_write(place / "out.csv") as part:
@@ -266,7 +269,7 @@ def interrupt_everywhere(place):
         number = 1
         while run_interrupted(function, number):
             assert names(place) in ([], ["out.csv"]), f"{function.__name__}, instruction {number}"
-            number += 1
+            number += 3
         numbers.append(number)
         assert (place / "out.csv").read_text() == "whole"
     return numbers
