@@ -320,6 +320,7 @@ class _Valid:
             "VehicleDetector.track": {"found": detector.search(image)},
             "batch_status": {"out": folder},
             "bounding_boxes": {"params": None},
+            "bin_spatial": {**lesson, "size": 16},
             "calibrate_scores": {"labels": [1, 0]},
             "calibration_error": {"probabilities": [0.2, 0.5], "labels": [0, 1], "bins": 5},
             "compare_configurations": {"configurations": {"a": params}, "options": quick},
@@ -330,8 +331,6 @@ class _Valid:
             "course.find_car_windows": lesson_only,
             "course.find_cars": lesson_only,
             "course.search_windows": {**lesson_only, "color_space": "RGB", "orient": 4},
-            "course.draw_labeled_bboxes": {"labels": (heat.astype(np.int32), 0)},
-            "course.get_hog_features": {"img": image[..., 0]},
             "course.bounding_boxes": {"windows": boxes},
             "course.show_images": {"titles": ["a"]},
             "course.process_image": {"method": 2},
@@ -339,7 +338,10 @@ class _Valid:
             "evaluate_detections": {"labels": truth},
             "evaluate_distances": {"labels": truth},
             "evaluate_tracks": {"labels": truth},
+            "color_hist": lesson,
             "count_vehicles": {"table": predicted},
+            "draw_labeled_bboxes": {**lesson, "labels": (heat.astype(np.int32), 0)},
+            "get_hog_features": {**lesson, "img": image[..., 0]},
             "extract_features": {"jobs": 1},
             "find_cars": {"params": search, "jobs": 1},
             "find_events": {"table": predicted},
@@ -420,7 +422,7 @@ def _names(argument: str, text: str, error: BaseException) -> bool:
 
 
 _ALSO_OTHER_ERRORS = (
-    "TrackTable.append(", "course.bin_spatial(size", "course.draw_labeled_bboxes(img",
+    "TrackTable.append(", "bin_spatial(size", "draw_labeled_bboxes(img",
     "notebook.plot_tracks(min_frames",
 )  # fmt: skip
 """Calls whose error may be that of another argument, which the bad one contradicts."""

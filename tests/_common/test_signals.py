@@ -32,6 +32,11 @@ def interrupt():
     signal.raise_signal(signal.SIGINT)
 
 
+def wait():
+    for _ in range(500):  # the interrupt does not end a call of sleep
+        time.sleep(0.02)
+
+
 class Interrupting:
     def __del__(self):
         interrupt()
@@ -60,8 +65,7 @@ def test_an_interrupt_that_would_be_lost_is_repeated(handlers, arrive):
     with handlers():
         arrive()
         with pytest.raises(KeyboardInterrupt):
-            for _ in range(500):  # it does not end a call of sleep
-                time.sleep(0.02)
+            wait()
 
 
 @pytest.mark.parametrize("handlers", [worker_signals, raise_on_signals])
