@@ -26,6 +26,7 @@ SOURCES = {
     "tools",
 }
 TEXTS = {"README.md", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "SECURITY.md", "LICENSE"}
+TEXTS |= {"CODE_OF_CONDUCT.md"}
 
 
 @pytest.fixture(scope="module")

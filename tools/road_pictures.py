@@ -1,6 +1,8 @@
-"""Make the picture of docs/roads.md: ``python -m tools.road_pictures -o docs/results/rendered_roads.jpg``.
+"""Make pictures of roads: ``python -m tools.road_pictures -o FILE.jpg`` or ``--clip CLIP.mp4``.
 
-It shows what both models find in rendered scenes, which neither was trained on; no real frame is shown.
+That of docs/roads.md shows what both models find in rendered scenes, which neither was trained on. With the
+course's project video as ``--clip``, its last frame is annotated for the README; docs/road_license.txt is its
+license.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from vehicle_detection import VehicleDetector
+from vehicle_detection import Annotator, Camera, DrawParams, VehicleDetector, track, write_image
 from vehicle_detection._common import atomic_write
 from vehicle_detection.notebook import plot_methods
 from vehicle_detection.training import rendered_source
@@ -39,6 +41,17 @@ def make_picture(path: Path, *, jobs: int | None = None) -> None:
         figure.savefig(part, format="jpg", dpi=90, pil_kwargs={"quality": 86})
 
 
+def annotate_last_frame(clip: Path, path: Path) -> None:
+    """Write the last frame of a clip with its tracks and the bird's-eye view."""
+    annotator = Annotator(DrawParams(panel="corner"))
+    detector = VehicleDetector(camera=Camera.dashcam(fov=58), annotator=annotator)
+    with detector, track(clip, detector, start=12.0, frames=True) as run:
+        for result in run:
+            assert result.frame is not None
+            picture = detector.annotate(result.frame, result)
+    write_image(path, picture)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Render, detect and write the picture."""
     parser = argparse.ArgumentParser(
@@ -47,7 +60,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "-o", "--output", metavar="FILE.jpg", type=Path, default=Path("docs/results/rendered_roads.jpg")
     )
-    make_picture(parser.parse_args(arguments).output)
+    parser.add_argument("--clip", metavar="CLIP.mp4", type=Path, help="write docs/road.jpg from it instead")
+    options = parser.parse_args(arguments)
+    if options.clip is None:
+        make_picture(options.output)
+    else:
+        annotate_last_frame(options.clip, Path("docs/road.jpg"))
 
 
 if __name__ == "__main__":

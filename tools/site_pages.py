@@ -22,6 +22,8 @@ ROOT = Path(__file__).resolve().parents[1]
 COPIES = {
     "CHANGELOG.md": "docs/changelog.md",
     "CONTRIBUTING.md": "docs/contributing.md",
+    "CODE_OF_CONDUCT.md": "docs/code_of_conduct.md",
+    "SECURITY.md": "docs/security.md",
     "notebooks/README.md": "docs/notebooks/index.md",
     "vehicle_detection/models/default.md": "docs/models/default.md",
     "vehicle_detection/models/highway.md": "docs/models/highway.md",
@@ -146,7 +148,7 @@ def api_pages() -> dict[str, str]:
     described = {name: names.get(name, []) for name in API_MODULES}
     pages = {}
     for page, title, modules in API_PAGES:
-        found = sorted((name for module in modules.split() for name in names.pop(module)), key=str.lower)
+        found = sorted((name for module in modules.split() for name in names.pop(module)), key=_place_in_page)
         table = [".. autosummary::", "", *(f"   {name}" for name in found), ""]
         pages[f"{page}.rst"] = "\n".join(
             [*_heading(title), ".. currentmodule:: vehicle_detection", "", *table, *map(_directive, found)]
@@ -177,6 +179,11 @@ _NOTEBOOKS_TOCTREE = """
 [0-9]*
 ```
 """
+
+
+def _place_in_page(name: str) -> tuple[bool, str]:
+    """Order of names: the detector that most users need comes first."""
+    return name != "VehicleDetector", name.lower()
 
 
 def _heading(title: str) -> list[str]:
