@@ -14,7 +14,7 @@ def test_demo_draws_annotates_and_scores(tmp_path):
     assert out.startswith("3 rendered frames of 1280x720")
     for name in ("F1", "mean IoU", "MOTA", "identity switches"):
         assert re.search(rf"^  {name} +(-?\d\S*|nan)\s*$", out, re.MULTILINE), out
-    assert re.search(r"speed +\d+\.\d frames/s", out)
+    assert re.search(r"speed +\d+\.\d frames/s on this machine, \d+\.\d times real time", out)
     assert re.search(r"boxes +\d+ on a vehicle, \d+ missed, \d+ false", out)
     assert out.splitlines()[-1] == f"wrote {', '.join(files)} in {folder}"
     assert contents(folder) == sorted(files)

@@ -41,6 +41,7 @@ def demo(
     with output_folder(output, "--output"), vd.VehicleDetector(camera=camera) as detector:
         drive = vd.render_drive(frames=frames, random_state=seed)
         done, scores = _run(output, detector, drive, files)
+    speed = done.frames_per_second / float(done.fps)
     print_facts(
         f"{scores.frames} rendered frames of 1280x720, {scores.vehicles} vehicles, {scores.tracks} tracks",
         {
@@ -49,9 +50,14 @@ def demo(
             "MOTA": f"{scores.mota:.3f}",
             "boxes": f"{scores.tp} on a vehicle, {scores.fn} missed, {scores.fp} false",
             "identity switches": scores.id_switches,
-            "speed": f"{done.frames_per_second:.1f} frames/s",
+            "speed": f"{done.frames_per_second:.1f} frames/s on this machine, {speed:.1f} times real time",
         },
     )
+    if speed < 1:
+        print_line(
+            "slower than real time: vehicle-detection video --every 4 searches fewer frames, --tracks without "
+            "-o writes no video, and other programs that keep the processor busy slow it down"
+        )
     print_line(f"wrote {', '.join(files)} in {output}")
 
 
