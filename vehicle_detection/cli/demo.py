@@ -55,8 +55,8 @@ def demo(
     )
     if speed < 1:
         print_line(
-            "slower than real time: vehicle-detection video --every 4 searches fewer frames, --tracks without "
-            "-o writes no video, and other programs that keep the processor busy slow it down"
+            "slower than real time: video --every 4 searches fewer frames, and --tracks without -o writes no "
+            "video; other programs that keep the processor busy slow it down"
         )
     print_line(f"wrote {', '.join(files)} in {output}")
 
