@@ -497,7 +497,7 @@ class VehicleDetector(Closing):
             Once, if speeds are estimated although neither times nor a frame rate are known.
         """
         with self._one_thread:
-            start, time = clock.perf_counter(), _check_time(time)
+            start, time = clock.thread_time(), _check_time(time)
             shape = check_image(frame, "frame").shape
             found = self._search_next(frame) if check_bool(search, "search") else None
             cut = self._cuts.update(frame)
@@ -528,7 +528,7 @@ class VehicleDetector(Closing):
             return self._track(found, _check_time(time), frames, check_bool(cut, "cut"))
 
     def _track(self, found: SearchResult, time: float | None, frames: int, cut: bool) -> FrameResult:
-        start, heat_params = clock.perf_counter(), self.detector.heat_params
+        start, heat_params = clock.thread_time(), self.detector.heat_params
         if heat_params is None:
             detections = self.detector.fit(found)
         else:
@@ -536,9 +536,9 @@ class VehicleDetector(Closing):
                 self._heat_history.clear()
             self.heat = self._heat_history.add(frame_heat(found.shape, found.windows, heat_params))
             detections = label_heat(self.heat, heat_params)
-        detected = clock.perf_counter()
+        detected = clock.thread_time()
         tracks = self.tracker.update(detections, found.shape, time=time, frames=frames, cut=cut)
-        tracked = clock.perf_counter()
+        tracked = clock.thread_time()
         seconds = {"search": found.seconds, "regions": detected - start, "track": tracked - detected}
         self._index, self._skipped = self._index + frames, 0
         shown = detections[detections.scores >= 0]  # lower scores are for the tracker only

@@ -44,6 +44,8 @@ def test_a_complete_video_keeps_frames_rate_and_sound(clip, tmp_path):
     assert list(report.stages) == ["decode", "search", "heat", "track", "draw", "encode"]
     assert report.stages["heat"] == pytest.approx(0.02)
     assert min(report.stages.values()) > 0
+    assert report.waiting.keys() == {"decode", "search", "track", "encode"}
+    assert all(0 <= seconds <= report.seconds for seconds in report.waiting.values())
     assert sum(report.stage_fractions.values()) == pytest.approx(1)
     assert os.listdir(tmp_path) == ["out.mp4"]
     assert target.stat().st_mode & 0o444 == 0o444

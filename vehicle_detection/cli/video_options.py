@@ -62,7 +62,7 @@ class VideoOptions:
     preset: str = shared.PRESET
     no_audio: bool = shared.NO_AUDIO
     quiet: bool = output_flag("-q", "Print errors and warnings of damage only.", "--quiet")
-    profile: bool = output_flag("--profile", "Print the time of each stage.")
+    profile: bool = output_flag("--profile", "Print the processor time and the waiting of each stage.")
     start: str | None = input_option(None, "TIME", "Start time, such as 12.5 (seconds) or 12:30.")
     end: str | None = input_option(None, "TIME", "End time, such as 30 (seconds) or 1:02:06.")
     fps: float | None = input_option(

@@ -43,7 +43,7 @@ def interpolate_results(
         raise InvalidInputError("before and after must have times; pass time= to track")
     results, following = [], () if after is None else after.tracks
     for number, time in enumerate(times):
-        start = clock.perf_counter()
+        start = clock.thread_time()
         tracks = interpolate_tracks(before.tracks, following, time - before.time, end - time, shape)
         results.append(FrameResult.unsearched(before.index + 1 + number, time, tracks, start))
     return results

@@ -165,7 +165,7 @@ class FrameResult:
         Positive windows and boxes of this frame, before tracking; and all tracks, of which those with
         ``track.shown`` are vehicles to draw.
     seconds
-        Time spent per stage: ``"search"``, ``"regions"``, ``"track"``.
+        Seconds per stage: ``"search"`` (elapsed), ``"regions"`` and ``"track"`` (processor time).
     searched
         Whether the frame was searched. If not, it has neither windows nor detections, and its tracks are
         interpolated or predicted.
@@ -192,8 +192,8 @@ class FrameResult:
     def unsearched(
         cls, index: int, time: float | None, tracks: tuple[Track, ...], started: float
     ) -> FrameResult:
-        """Make the result of a frame that was not searched, whose tracking `started` at this clock time."""
-        none, seconds = Detections.empty(), {"track": clock.perf_counter() - started}
+        """Make the result of a frame that was not searched, whose tracking `started` at this thread time."""
+        none, seconds = Detections.empty(), {"track": clock.thread_time() - started}
         return cls(index, time, none, none, tracks, seconds, searched=False)
 
     @property

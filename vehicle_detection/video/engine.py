@@ -15,7 +15,7 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Protocol, Self
 
@@ -81,18 +81,19 @@ class VideoDetector(Protocol):
 class VideoReport:
     """Counts and times of a run of `track` or `process_video`.
 
-    The stages are ``"decode"``, ``"search"``, the detector's other stages, ``"draw"`` and ``"encode"``.
-    Decode and encode are processor time over all cores, the others elapsed time, all without waiting. Stages
-    run in parallel, so their sum may exceed `seconds`.
+    The stages are ``"decode"``, ``"search"``, the detector's other stages, ``"draw"`` and ``"encode"``, which
+    run in parallel; their times are processor time over all cores, with that of ffmpeg. The search has what
+    no other stage of this process has used. The stage that waits least limits the speed.
 
-    >>> stages = {"decode": 1.0, "search": 3.0, "encode": 4.0}
-    >>> shape = (720, 1280, 3)
-    >>> print(VideoReport(frames=250, fps=Fraction(25), shape=shape, seconds=5.0, stages=stages, tracks=2))
+    >>> stages, waiting = {"decode": 1.0, "search": 3.0, "encode": 4.0}, {"decode": 3.5, "encode": 0.5}
+    >>> shape, fps = (720, 1280, 3), Fraction(25)
+    >>> times = {"seconds": 5.0, "stages": stages, "waiting": waiting}
+    >>> print(VideoReport(frames=250, fps=fps, shape=shape, tracks=2, **times))
     250 frames of 1280x720 in 5.0 s: 50.0 frames/s, 2.0 times real time, 2 vehicles
-    stage    ms/frame  fraction
-    decode       4.00     12.5%
+    stage    ms/frame  fraction  waiting
+    decode       4.00     12.5%    14.00
     search      12.00     37.5%
-    encode      16.00     50.0%
+    encode      16.00     50.0%     2.00
     """
 
     frames: int
@@ -101,6 +102,7 @@ class VideoReport:
     seconds: float  # elapsed time
     stages: Mapping[str, float]  # seconds of work
     tracks: int  # number of different tracks shown
+    waiting: Mapping[str, float] = field(default_factory=dict)  # seconds that stages waited for others
     dropped: int = 0  # frames of a live source that were dropped because the search was busy
     damage: str = ""  # what is damaged in the source, such as missing frames; empty if nothing is
 
@@ -121,10 +123,12 @@ class VideoReport:
         lines = [
             f"{pluralize(self.frames, 'frame')} of {width}x{height} in {self.seconds:.1f} s: {rate:.1f} "
             f"frames/s, {rate / self.fps:.1f} times real time, {pluralize(self.tracks, 'vehicle')}{dropped}",
-            "stage    ms/frame  fraction",
+            "stage    ms/frame  fraction" + "  waiting" * bool(self.waiting),
         ]
+        scale = 1e3 / max(self.frames, 1)
         for name, seconds in self.stages.items():
-            lines.append(f"{name:<8} {seconds / max(self.frames, 1) * 1e3:>8.2f} {fractions[name]:>9.1%}")
+            waiting = f" {self.waiting[name] * scale:>8.2f}" if name in self.waiting else ""
+            lines.append(f"{name:<8} {seconds * scale:>8.2f} {fractions[name]:>9.1%}{waiting}")
         return "\n".join(lines)
 
 
@@ -175,8 +179,11 @@ class _Pipeline:
     """
 
     def __init__(self, plan: _Plan) -> None:
-        self._plan, self._detector = plan, plan.detector
+        self._plan, self._detector, self.jobs = plan, plan.detector, plan.jobs
         self.stages: defaultdict[str, float] = defaultdict(float)
+        self.waiting: dict[str, float] = {}
+        self.searching = 0.0  # elapsed seconds of all searches
+        self.decoding = 0.0  # processor time of the decoding thread
         self.dropped = 0  # frames that a live source dropped
         self.damage = ""  # what is damaged in the source; known after the last frame
         self._queue: ClosableQueue[_QueuedFrame] = ClosableQueue(plan.lookahead)
@@ -214,6 +221,7 @@ class _Pipeline:
 
     def _decode_in_thread(self) -> None:
         error: BaseException | None = None
+        started = time.perf_counter()
         try:
             with self._plan.source.read(self._plan.first, self._plan.count) as reader:
                 with self._lock:
@@ -228,7 +236,10 @@ class _Pipeline:
         except BaseException as caught:  # raised in the calling thread after the frames before it
             error = caught
         finally:
-            self.stages["decode"] += time.thread_time()
+            cpu = time.thread_time()
+            self.waiting["decode"] = time.perf_counter() - started - cpu
+            self.stages["decode"] += cpu
+            self.decoding = cpu
             self._queue.finish(error)
             self._pool.shutdown()
 
@@ -284,7 +295,7 @@ class _Pipeline:
             found, seconds = item.search.result()
         except DetectorError as error:
             raise DetectorError(f"at {item.time:.2f} s: {error}") from error
-        self.stages["search"] += seconds
+        self.searching += seconds
         frames = 1 + len(waiting) + item.dropped
         return self._detector.track(found, time=item.time, frames=frames, cut=item.cut)
 
@@ -328,6 +339,8 @@ class TrackRun(Closing):
         self._entered = self.stopped = False
         self._frames, self._track_ids = 0, set[int]()
         self._started = self._logged = self._seconds = 0.0
+        self._cpu_started = _processor_times()
+        self._cpu: tuple[float, float] | None = None
 
     def __enter__(self) -> Self:
         self._entered = True  # the sound of the source may be read after the last result
@@ -365,6 +378,7 @@ class TrackRun(Closing):
         self._on_end.callback(self._results.close)
         self.detector.reset(fps=float(self.info.fps))
         self._started = self._logged = time.perf_counter()
+        self._cpu_started = _processor_times()
 
     def _position(self, frames: int) -> str:
         """Return the length of a number of frames in minutes and seconds."""
@@ -377,18 +391,28 @@ class TrackRun(Closing):
 
     def report(self) -> VideoReport:
         """Return counts and times so far; the time of the run is complete once it is closed."""
+        pipeline, seconds = self._pipeline, self._seconds or time.perf_counter() - self._started
+        own, others = self._cpu or self._measure()
+        pipeline.stages["search"] = max(others - pipeline.decoding, 0.0)
+        waiting = {"search": seconds - pipeline.searching / pipeline.jobs, "track": seconds - own}
         order = {"decode": -2, "search": -1, "draw": 1, "encode": 2}
-        stages = sorted(self._pipeline.stages.items(), key=lambda stage: order.get(stage[0], 0))
+        stages = sorted(pipeline.stages.items(), key=lambda stage: order.get(stage[0], 0))
         return VideoReport(
             frames=self._frames,
             fps=self.info.fps,
             shape=self.info.shape,
-            seconds=self._seconds or time.perf_counter() - self._started,
+            seconds=seconds,
             stages=dict(stages),
+            waiting=pipeline.waiting | waiting,
             tracks=len(self._track_ids),
             dropped=self._pipeline.dropped,
             damage="; ".join(filter(None, (self._pipeline.damage, self.source.find_change()))),
         )
+
+    def _measure(self) -> tuple[float, float]:
+        """Processor time of the calling thread, and of the others, since the start."""
+        own, others = (now - start for now, start in zip(_processor_times(), self._cpu_started, strict=True))
+        return own, others
 
     def stop(self) -> None:
         """End the source, from any thread; the frames read so far complete the run."""
@@ -398,7 +422,7 @@ class TrackRun(Closing):
     def close(self) -> None:
         """End all processes and threads."""
         if self._started and not self._seconds:
-            self._seconds = time.perf_counter() - self._started
+            self._seconds, self._cpu = time.perf_counter() - self._started, self._measure()
         self._on_end.close()
         self._on_close.close()
 
@@ -479,6 +503,12 @@ def track(
             frames=frames,
         )
         return TrackRun(plan, end=end, progress=progress, on_close=stack.pop_all())
+
+
+def _processor_times() -> tuple[float, float]:
+    """Processor time in seconds of the calling thread, and of the other threads of this process."""
+    own = time.thread_time()
+    return own, time.process_time() - own
 
 
 @contextlib.contextmanager

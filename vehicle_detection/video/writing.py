@@ -249,12 +249,14 @@ def write_video(
         if sink is not None:
             sink.finish(trim_sound=results.stopped)
     report = results.report()
-    stages = dict(report.stages)
+    stages, waiting = dict(report.stages), dict(report.waiting)
     if drawing is not None:
         stages["draw"] = drawing.seconds
     if sink is not None:
-        stages["encode"] = sink.seconds
-    return dataclasses.replace(report, seconds=time.perf_counter() - started, stages=stages)
+        stages["search"] = max(stages["search"] - sink.thread_seconds, 0.0)
+        stages["encode"], waiting["encode"] = sink.seconds, sink.waiting
+    seconds = time.perf_counter() - started
+    return dataclasses.replace(report, seconds=seconds, stages=stages, waiting=waiting)
 
 
 class TrackOptions(TypedDict, total=False):
@@ -308,7 +310,7 @@ class _Drawing:
 
     def draw(self, result: FrameResult) -> tuple[NDArray[np.uint8], int]:
         """Return the picture of a result, and the number of frames that were dropped before it."""
-        start, frame = time.perf_counter(), result.frame
+        start, frame = time.thread_time(), result.frame
         assert frame is not None
         drawn = self._annotator.draw(frame, result)
         if getattr(drawn, "shape", None) != self._shape or drawn.dtype != np.uint8:
@@ -318,7 +320,7 @@ class _Drawing:
             )
         missed = result.index - self._expected if self._expected >= 0 else 0
         self._expected = result.index + 1
-        self.seconds += time.perf_counter() - start
+        self.seconds += time.thread_time() - start
         return np.ascontiguousarray(drawn), missed
 
 
@@ -335,8 +337,8 @@ class _Sink(Closing):
         self._thread = threading.Thread(target=self._encode, name="vehicle-encode")
         self._lock = threading.Lock()
         self._aborted = self._trim_sound = False
-        self.seconds = 0.0
-        """Processor time of the thread and of ffmpeg, known after the last picture."""
+        self.seconds = self.thread_seconds = self.waiting = 0.0
+        """Processor time of the thread and ffmpeg, and of the thread; and its time without work."""
 
     def put(self, picture: NDArray[np.uint8], *, repeats: int = 0) -> None:
         """Append a picture after repeating the last one; raise an error of the encoder."""
@@ -365,6 +367,7 @@ class _Sink(Closing):
             self._thread.join()
 
     def _encode(self) -> None:
+        started = time.perf_counter()
         try:
             with self._open_writer as writer:
                 with self._lock:
@@ -382,7 +385,9 @@ class _Sink(Closing):
         except BaseException as error:  # raised in the calling thread at its next picture
             self._pictures.abort(error)
         finally:
-            self.seconds += time.thread_time()
+            self.thread_seconds = time.thread_time()
+            self.waiting = time.perf_counter() - started - self.thread_seconds
+            self.seconds += self.thread_seconds
 
 
 @contextlib.contextmanager
