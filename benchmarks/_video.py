@@ -28,7 +28,7 @@ def run(context: Context) -> list[Row]:
         for _ in range(ROUNDS):
             moviepy_seconds.append(seconds_of(lambda: rewrite(source, target)))
             for name, detector in detectors.items():
-                report = process_video(source, target, detector, preset="veryfast", progress=False)
+                report = process_video(source, target, detector, progress=False)
                 reports[name].append(report)
     moviepy_median = median_of(moviepy_seconds)
     frames = reports["highway"][0].frames

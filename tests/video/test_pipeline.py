@@ -28,6 +28,7 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.tracking import FrameResult, Track, TrackParams, interpolate_results
 from vehicle_detection.video import (
+    Encoding,
     FrameSource,
     engine,
     open_source,
@@ -123,9 +124,9 @@ def test_a_killed_encoder_is_an_error(clip, tmp_path, monkeypatch):
 
 
 def test_an_encoder_that_does_not_start_is_an_error(clip, tmp_path, monkeypatch):
-    monkeypatch.setattr(writing, "PRESETS", ("no such speed",))
+    monkeypatch.setattr(Encoding, "_options", lambda *_: ["-c:v", "libx264", "-preset", "no such speed"])
     with pytest.raises(VideoError, match=r"out.mp4 cannot be written: ffmpeg reports"):
-        process_video(clip, tmp_path / "out.mp4", StubDetector(), preset="no such speed")
+        process_video(clip, tmp_path / "out.mp4", StubDetector(), encoding=Encoding())
     assert os.listdir(tmp_path) == []
 
 

@@ -16,7 +16,16 @@ from moviepy.config import FFMPEG_BINARY
 from tests.helpers import StubDetector
 from tests.video.clips import NTSC, ffmpeg, ffmpeg_log, frame_numbers, sound_seconds
 from vehicle_detection.errors import InvalidInputError, TransientVideoError
-from vehicle_detection.video import VideoReport, engine, open_source, probe_video, process_video, read_frames
+from vehicle_detection.video import (
+    Encoding,
+    VideoReport,
+    encoding,
+    engine,
+    open_source,
+    probe_video,
+    process_video,
+    read_frames,
+)
 
 
 def test_a_complete_video_keeps_frames_rate_and_sound(clip, tmp_path):
@@ -142,7 +151,6 @@ def test_a_report_without_frames():
         ({"end": 0}, "end must be later than the start; got 0 s to 0 s"),
         ({"start": 60}, r"start must be less than the video's length of 0\.\d+ s; got 60 s"),
         ({"start": 0.001, "end": 0.002}, "end must be at least one frame later than the start, at 29.97"),
-        ({"preset": "warp"}, "preset must be one of 'ultrafast'"),
         ({"jobs": 0}, "jobs must be an integer at least 1"),
         ({"on_result": 3}, "on_result must be a function"),
         ({"detector": object()}, "detector must have the methods .* without search; pass a VehicleDetector"),
@@ -154,6 +162,7 @@ def test_a_report_without_frames():
         ({"target": "."}, "target must be a file, got the folder"),
         ({"target": "out.gif"}, r"target must end in .mp4 or .*, got 'out.gif'; write 'out.mp4'"),
         ({"target": 7}, "target must be the path"),
+        ({"encoding": "fast"}, "encoding must be"),
     ],
 )
 def test_bad_arguments(clip, tmp_path, monkeypatch, options, message):
@@ -220,8 +229,38 @@ def test_any_file_name(clip, tmp_path, monkeypatch, name):
 )
 def test_real_clips_keep_frames_and_sound(real_data, tmp_path, name, frames, sound):
     source, target = real_data / "videos" / name, tmp_path / "out.mp4"
-    report = process_video(source, target, StubDetector(), preset="ultrafast")
+    report = process_video(source, target, StubDetector(), encoding=Encoding(preset="ultrafast"))
     before, after = probe_video(source), probe_video(target)
     assert report.frames == frames
     assert (after.frames, after.fps, after.shape) == (before.frames, before.fps, before.shape)
     assert after.has_audio == sound
+
+
+def test_the_quality_is_chosen(clip, tmp_path):
+    sizes = []
+    for crf in (10, None, 40):
+        target = tmp_path / f"{crf}.mp4"
+        process_video(clip, target, StubDetector(), audio=False, encoding=Encoding(crf=crf))
+        sizes.append(target.stat().st_size)
+    assert sizes[0] > sizes[1] > sizes[2]
+
+
+@pytest.mark.parametrize("name", encoding.ENCODERS)
+def test_x264_replaces_an_encoder_that_does_not_work(clip, tmp_path, caplog, monkeypatch, name):
+    monkeypatch.setattr(encoding, "_failure", lambda encoder: f"no {encoder}")
+    assert process_video(clip, tmp_path / "out.mp4", StubDetector(), encoding=Encoding(encoder=name)).frames
+    assert "libx264" in Encoding(encoder=name).options("null")
+    replaced = name not in ("auto", "x264")
+    assert (f"because {name} does not work here (no {name})" in caplog.text) == replaced
+
+
+def test_the_first_encoder_that_works_is_chosen(monkeypatch):
+    monkeypatch.setattr(encoding, "_failure", lambda encoder: "" if encoder == "vaapi" else "missing")
+    options = " ".join(Encoding(encoder="auto", crf=30).options("null"))
+    assert "-vf null,format=nv12,hwupload -c:v h264_vaapi -qp 30" in options
+    assert "nvenc" in Encoding(encoder="auto")._options("nvenc", "null")[3]
+
+
+def test_a_missing_graphics_processor_is_noticed():
+    assert encoding._failure("videotoolbox")
+    assert not encoding._failure("x264")

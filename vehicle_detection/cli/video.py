@@ -62,7 +62,7 @@ def video(options: VideoOptions) -> None:
                 progress=not options.quiet,
                 show=options.show,
                 audio=not options.no_audio,
-                preset=options.preset,
+                encoding=options.encoding(),
                 on_result=lambda result: [write(result) for write in writers],
                 **tracking,
             )
@@ -87,7 +87,7 @@ def _check_run(options: VideoOptions, source: FrameSource, detector: vd.VehicleD
 
     vd.track(source, detector, jobs=options.jobs, every=options.every, **options.span()).close()
     if options.output is not None:
-        check_video_target(options.output, source.files, preset=options.preset)
+        check_video_target(options.output, source.files)
 
 
 def _check(options: VideoOptions) -> None:
@@ -126,6 +126,7 @@ def _check(options: VideoOptions) -> None:
     if options.diagnostics and options.panel != "none":
         raise InvalidInputError("--panel has no place with --diagnostics; omit one of them")
     check_blur(options.blur)
+    options.encoding()
     if options.blur is not None and options.output is None and not options.show:
         raise InvalidInputError("--output must name a video for --blur, which blurs its vehicles; add it")
 

@@ -25,7 +25,7 @@ from vehicle_detection.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from vehicle_detection.video import FrameSource
+    from vehicle_detection.video import Encoding, FrameSource
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +60,10 @@ class VideoOptions:
         None, "FILE", "Subtitles with vehicles, nearest distance and events, second by second: .srt or .ass."
     )
     preset: str = shared.PRESET
+    crf: int | None = output_option(None, "N", "Quality of the video, 0 (best) to 51; default: 23.")
+    encoder: str = output_option(
+        "x264", "NAME", "x264, nvenc, vaapi, videotoolbox, or auto: a graphics processor's if one works."
+    )
     no_audio: bool = shared.NO_AUDIO
     quiet: bool = output_flag("-q", "Print errors and warnings of damage only.", "--quiet")
     profile: bool = output_flag("--profile", "Print the processor time and the waiting of each stage.")
@@ -129,6 +133,13 @@ class VideoOptions:
     def span(self) -> dict[str, Any]:
         """First and last second of the source."""
         return {"start": parse_time(self.start, "--start"), "end": parse_time(self.end, "--end")}
+
+    def encoding(self) -> Encoding:
+        """How the copy is encoded."""
+        from vehicle_detection.video import Encoding
+
+        options: dict[str, Any] = {"preset": self.preset, "crf": self.crf, "encoder": self.encoder}
+        return Encoding(**options)
 
     def stated_horizon(self) -> float | None:
         """Return the horizon that the option states; None if it states none, or is to be estimated."""

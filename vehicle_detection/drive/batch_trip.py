@@ -47,7 +47,7 @@ from vehicle_detection.errors import (
 )
 from vehicle_detection.formats import DIGITS, track_records
 from vehicle_detection.network import Device
-from vehicle_detection.video import FrameSource, download, open_source, process_video
+from vehicle_detection.video import Encoding, FrameSource, download, open_source, process_video
 
 BUSY = "busy"
 """Status of a trip that another process is working on; it is not recorded."""
@@ -187,7 +187,7 @@ def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
         video = None if settings["tracks_only"] else folder / "video.mp4"
         try:
             with _open(task, folder) as source, _open_tracks(folder / "tracks.parquet", key) as write:
-                options = {name: settings[name] for name in ("audio", "preset")}
+                options = {"audio": settings["audio"], "encoding": Encoding(preset=settings["preset"])}
                 options |= {"every": settings["options"].get("every"), "jobs": 1, "progress": False}
                 report = process_video(source, video, detector, on_result=write, **options)
         except VideoError as error:

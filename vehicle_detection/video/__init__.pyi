@@ -1,4 +1,5 @@
 from .clips import annotate_clip
+from .encoding import PRESETS, Encoding
 from .engine import TrackRun, VideoDetector, VideoReport, track
 from .files import is_video_file, list_files, walk_files
 from .horizon import estimate_video_horizon
@@ -7,10 +8,11 @@ from .probe import VideoInfo
 from .remote import download, open_filesystem, with_retries
 from .sources import FrameSource
 from .viewer import Viewer, open_viewer
-from .writing import PRESETS, check_video_target, cut_video, process_video, write_video
+from .writing import check_video_target, cut_video, process_video, write_video
 
 __all__ = [
     "PRESETS",
+    "Encoding",
     "FrameSource",
     "Source",
     "TrackRun",

@@ -22,15 +22,16 @@ from vehicle_detection._common import (
     Closing,
     atomic_write,
     call_in_thread,
-    check_choice,
     check_flags,
     check_path,
     check_suffix,
+    check_type,
     describe,
     temporary_folder,
 )
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.tracking import FrameResult
+from vehicle_detection.video.encoding import Encoding
 from vehicle_detection.video.engine import TrackRun, VideoDetector, VideoReport, track
 from vehicle_detection.video.ffmpeg import Process, exit_reason, run_ffmpeg
 from vehicle_detection.video.opening import Source, borrow_source
@@ -40,11 +41,6 @@ from vehicle_detection.video.reading import AudioSource, check_span, frame_range
 from vehicle_detection.video.sources import FrameSource
 from vehicle_detection.video.viewer import open_viewer
 from vehicle_detection.video.yuv import planes_from_rgb
-
-PRESETS = (
-    "ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow", "placebo",
-)  # fmt: skip
-"""Presets of the H.264 encoder, from the fastest to the one with the smallest files."""
 
 CONTAINERS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
 """ffmpeg's name of the container for each suffix that can be written."""
@@ -63,7 +59,7 @@ class FrameWriter(Closing):
     """
 
     def __init__(
-        self, path: Path, info: VideoInfo, *, name: str, preset: str, audio: AudioSource | None
+        self, path: Path, info: VideoInfo, *, name: str, encoding: Encoding, audio: AudioSource | None
     ) -> None:
         """Start ffmpeg, which writes to `path`; `name` names the video in errors."""
         container = CONTAINERS[path.suffix.lower()]
@@ -87,7 +83,7 @@ class FrameWriter(Closing):
             encoded = ["-c:a", "aac", "-b:a", "192k", "-af", _SYNCHRONIZED + end]
             mapped += ["-map", f"1:a:{info.audio_track}", *(["-c:a", "copy"] if copied else encoded)]
         filters = "setparams=colorspace=smpte170m:color_primaries=bt709:color_trc=bt709:range=tv"
-        encoder = ["-vf", filters, "-c:v", "libx264", "-preset", preset, "-fps_mode", "passthrough"]
+        encoder = [*encoding.options(filters), "-fps_mode", "passthrough"]
         # Chapters and other metadata are those of the whole source, and its title and place may be private.
         self._muxer = ["-map_chapters", "-1", "-map_metadata", "-1", "-f", container]
         if container != "matroska":  # the index at the front lets a browser play while it downloads
@@ -181,7 +177,7 @@ def write_video(
     annotator: VideoAnnotator,
     *,
     audio: bool = True,
-    preset: str = "veryfast",
+    encoding: Encoding | None = None,
     show: bool = False,
     on_result: Callable[[FrameResult], object] | None = None,
 ) -> VideoReport:
@@ -203,8 +199,8 @@ def write_video(
     audio
         Keep the sound. It is copied if the whole video is processed and every player supports its codec,
         otherwise it is encoded as AAC.
-    preset
-        Speed of the H.264 encoder, from "ultrafast" to "placebo"; `PRESETS` of `vehicle_detection.video`.
+    encoding
+        Preset, quality and encoder, an `Encoding` of `vehicle_detection.video`; None: x264, "veryfast".
     show
         Show the annotated frames in a window, or in a notebook below the cell. Closing the window, or the key
         Escape, ends the run and completes the target.
@@ -223,14 +219,15 @@ def write_video(
         stack.enter_context(results)
         stack.enter_context(_name_changed_source(results.source))
         check_flags(audio=audio, show=show)
+        check_type(encoding, "encoding", Encoding | None, "omit it for the default")
         if on_result is not None and not callable(on_result):
             raise InvalidInputError(f"on_result must be a function of a result, got {describe(on_result)}")
         started, sink, viewer = time.perf_counter(), None, None
         drawing = None if target is None and not show else _Drawing(annotator, results)
         if drawing is not None and target is not None:
-            output = check_video_target(target, results.source.files, preset=preset)
+            output = check_video_target(target, results.source.files)
             sound = results.sound() if audio else None
-            sink = stack.enter_context(_Sink(_open_writer(output, drawing.info, preset, sound)))
+            sink = stack.enter_context(_Sink(_open_writer(output, drawing.info, encoding, sound)))
         if show:
             viewer = stack.enter_context(contextlib.closing(open_viewer(results.source.name)))
         stack.enter_context(_stop_on_interrupt(results))
@@ -274,7 +271,7 @@ def process_video(
     detector: VideoDetector,
     *,
     audio: bool = True,
-    preset: str = "veryfast",
+    encoding: Encoding | None = None,
     show: bool = False,
     on_result: Callable[[FrameResult], object] | None = None,
     progress: bool = True,
@@ -291,10 +288,12 @@ def process_video(
     """
     draws = target is not None or show
     if target is not None:
-        check_video_target(target, preset=preset)
+        check_video_target(target)
     results = track(source, detector, frames=draws, progress=progress, **options)
     annotator: Any = getattr(results.detector, "annotator", None)
-    return write_video(results, target, annotator, audio=audio, preset=preset, show=show, on_result=on_result)
+    return write_video(
+        results, target, annotator, audio=audio, encoding=encoding, show=show, on_result=on_result
+    )
 
 
 class _Drawing:
@@ -427,17 +426,17 @@ def cut_video(
     *,
     start: float | None = None,
     end: float | None = None,
-    preset: str = "veryfast",
+    encoding: Encoding | None = None,
 ) -> int:
     """Copy a part of a video, with its sound, to another file; returns the number of frames."""
     start, end = check_span(start, end)
     with borrow_source(source) as opened:
-        output = check_video_target(target, opened.files, preset=preset)
+        output = check_video_target(target, opened.files)
         first, count = frame_range(opened.info, start, end)
         with (
             _name_changed_source(opened),
             opened.read(first, count) as frames,
-            _open_writer(output, opened.info, preset, opened.audio(first, end)) as writer,
+            _open_writer(output, opened.info, encoding, opened.audio(first, end)) as writer,
         ):
             for _, _, frame in frames:
                 writer.write(frame)
@@ -447,19 +446,18 @@ def cut_video(
 
 @contextlib.contextmanager
 def _open_writer(
-    target: Path, info: VideoInfo, preset: str, audio: AudioSource | None
+    target: Path, info: VideoInfo, encoding: Encoding | None, audio: AudioSource | None
 ) -> Iterator[FrameWriter]:
     """Open a video file that is written atomically."""
     with (
         atomic_write(target) as part,
-        FrameWriter(part, info, name=str(target), preset=preset, audio=audio) as writer,
+        FrameWriter(part, info, name=str(target), encoding=encoding or Encoding(), audio=audio) as writer,
     ):
         yield writer
 
 
-def check_video_target(target: object, sources: Sequence[Path] = (), *, preset: str = "veryfast") -> Path:
+def check_video_target(target: object, sources: Sequence[Path] = ()) -> Path:
     """Return the path of a video that can be written and is none of the sources."""
-    check_choice(preset, "preset", PRESETS)
     path = check_suffix(
         check_path(target, "target", kind="the path of a video file"), "target", tuple(CONTAINERS)
     )
