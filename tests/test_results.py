@@ -5,10 +5,20 @@ from threading import Thread
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image, ImageShow
 
-from vehicle_detection import Detector, detect
+from vehicle_detection import (
+    Detections,
+    Detector,
+    TrackTable,
+    detect,
+    detector_from,
+    read_labels,
+    track,
+    write_tracks,
+)
 from vehicle_detection.camera import Camera
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
@@ -151,3 +161,35 @@ def test_files_are_read_again_for_the_picture(detector, tmp_path):
     (tmp_path / "road.png").unlink()
     with pytest.raises(InvalidInputError, match="does not exist"):
         found.plot()
+
+
+def test_tables_name_the_files_of_a_list(detector, expected, folder):
+    table = TrackTable.from_detections(detector.detect(folder))
+    assert table.frame_keys == ("a2.jpg", "a10.jpg")
+    assert len(table) == sum(map(len, expected))
+    assert TrackTable.from_detections(list(expected)).frame_keys == (0, 1)
+
+
+def test_tracks_have_the_class_of_most_detections(tmp_path):
+    def find(image):
+        kind = "truck" if image[0, 0, 0] % 3 else "car"
+        return Detections([[100, 60, 160, 100]], [0.9], labels=[kind], class_ids=[7])
+
+    frames = [np.full((180, 320, 3), number, np.uint8) for number in range(1, 21)]
+    own = detector_from(lambda image: find(image).with_columns(scores=np.array([0.9])))
+    results = [own.process(frame, time=number / 10) for number, frame in enumerate(frames)]
+    assert {track.label for track in results[-1].shown} == {"truck"}
+    assert results[-1].to_pandas()["label"].tolist() == ["truck"]
+    assert results[-1].shown[0].name == "truck #1"
+    for name in ("t.csv", "t.jsonl", "t.parquet"):
+        write_tracks(results, tmp_path / name)
+        assert set(read_labels(tmp_path / name)["label"]) == {"truck"}
+
+
+def test_a_video_becomes_a_table_at_once_or_frame_by_frame():
+    source = "test_images/road*.jpg"
+    whole = track(source, "highway", every=1).to_pandas()
+    assert {"frame", "track_id", "x1", "confidence", "label", "time_s"} <= {*whole}
+    with track(source, "highway", every=1) as run:
+        parts = pd.concat([result.to_pandas() for result in run], ignore_index=True)
+    pd.testing.assert_frame_equal(whole, parts)

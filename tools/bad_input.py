@@ -252,6 +252,7 @@ class _Valid:
         self.instances: dict[str, Any] = {
             "Annotator": vd.Annotator(), "Box": vd.course.Box(), "Camera": camera, "Detections": windows,
             "Detector": detector.detector, "Explorer": vd.Explorer([image], classifier),
+            "ImageDetections": detector.detect(image),
             "TrackTable": predicted, "FunctionParams": vd.FunctionParams(), "HeatHistory": vd.HeatHistory(),
             "FrameSource": vd.open_source(clip), "HeatmapDetector": vd.HeatmapDetector(classifier),
             "NetworkModel": vd.load_model("default"), "NetworkParams": vd.NetworkParams(),
@@ -289,6 +290,7 @@ class _Valid:
             "course.": lesson,
             "LabelledFrames": {"frames": [image, image], "labels": truth},
             "LabelledFrames.from_video": {"path": clip, "labels": truth},
+            "ImageDetections.save": {"path": folder / "found.png"},
             "TrackTable": {"frame": [0, 1], "track_id": np.array([1, 1]), "boxes": boxes},
             "TrackTable.from_detections": {"detections": {0: windows}},
             "TrackTable.from_pandas": {"table": predicted.to_pandas()},

@@ -91,8 +91,8 @@ class DrawParams(Checked):
     Attributes
     ----------
     labels
-        Fields of a label: ``"id"``, ``"score"`` (the confidence, if known), ``"distance"`` (``~`` where its
-        standard error exceeds 20%), ``"speed"`` (relative to the camera, positive when moving away) and
+        Fields of a label: ``"id"`` with the class, ``"score"`` (the confidence), ``"distance"`` (``~`` where
+        its standard error exceeds 20%), ``"speed"`` (relative to the camera, positive when moving away) and
         ``"std"`` (adds standard errors). Unknown values are omitted; without a field there is no label.
     line_width
         Width of the boxes' lines in pixels; None: chosen for the size of the image.
@@ -539,7 +539,7 @@ def track_fields(
     With the own speed the speed is that over ground, such as "94 km/h".
     """
     with_std, chosen = "std" in fields, UNITS[units]
-    parts = [f"#{track.id}"] if "id" in fields else []
+    parts = [track.name] if "id" in fields else []
     if "score" in fields:
         parts.append(f"{track.score:.1f}" if track.confidence is None else f"{track.confidence:.0%}")
     if "distance" in fields and track.distance_m is not None and track.distance_std_m is not None:

@@ -400,9 +400,11 @@ def _check_color(color: Color) -> Color:
 
 
 def score_texts(detections: Detections) -> list[str]:
-    """Confidence of each detection, such as "87%"; or its score if the confidence is unknown."""
-    known = detections.confidences
-    return [f"{score:.2f}" for score in detections.scores] if known is None else [f"{p:.0%}" for p in known]
+    """Confidence of each detection, such as "87%" or "car 87%"; its score if the confidence is unknown."""
+    known, labels = detections.confidences, detections.labels
+    texts = [f"{score:.2f}" for score in detections.scores] if known is None else [f"{p:.0%}" for p in known]
+    kinds = ["vehicle"] * len(texts) if labels is None else labels.tolist()
+    return [text if kind == "vehicle" else f"{kind} {text}" for kind, text in zip(kinds, texts)]
 
 
 def draw_detections(

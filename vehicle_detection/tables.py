@@ -27,7 +27,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.tracking import is_result, shown_tracks
+from vehicle_detection.tracking import TRACK_VALUES, UNKNOWN_LABEL, is_result, shown_tracks
 
 if TYPE_CHECKING:
     import pandas
@@ -39,7 +39,7 @@ NO_TRACK = -1
 
 CORNERS = ("x1", "y1", "x2", "y2")
 BOX_COLUMNS = ("frame", "track_id", *CORNERS, "score")
-TRACK_COLUMNS = (*BOX_COLUMNS, "distance_m", "speed_mps", "confidence", "distance_std_m", "speed_std_mps")
+TRACK_COLUMNS = (*BOX_COLUMNS[:-1], *TRACK_VALUES)
 """Columns of a table of tracks, in the order of the files."""
 LABEL_COLUMNS = ("occluded", "truncated", "ignore")
 
@@ -56,7 +56,7 @@ _ABSURD, _MAX_ID = 1e9, 2**62
 class _Column(NamedTuple):
     """Default of a column, which also sets its type, and its allowed range."""
 
-    missing: float
+    missing: float | str
     low: float = -math.inf
     high: float = math.inf
     expected: str = "a finite number"
@@ -70,6 +70,7 @@ _COLUMNS = {
     "confidence": _Column(math.nan, 0, 1, "a probability from 0 to 1"),
     "distance_std_m": _Column(math.nan, 0, expected="at least 0"),
     "speed_std_mps": _Column(math.nan, 0, expected="at least 0"),
+    "label": _Column(UNKNOWN_LABEL),
     "time_since_update": _Column(math.nan, 0, expected="at least 0"),
     "occluded": _Column(0, 0, expected="0 (visible), 1 (partly) or 2 (largely hidden)"),
     "truncated": _Column(0.0, 0, 1, "a fraction from 0 to 1"),
@@ -78,8 +79,7 @@ _COLUMNS = {
 """All columns except ``frame`` and the corners of the boxes."""
 _CORNER = _Column(math.nan, -_ABSURD, _ABSURD, f"a number of pixels up to {_ABSURD:g}")
 
-_VALUE_COLUMNS = TRACK_COLUMNS[6:]  # all but frame, track and box
-_APPENDED = (*_VALUE_COLUMNS, "time_since_update")  # of a `Track`
+_NUMBERS = (*TRACK_VALUES[:-1], "time_since_update")  # values of a `Track`
 
 
 class TrackTable:
@@ -104,8 +104,8 @@ class TrackTable:
         All frames, including those without a box; the frames of the rows are added.
     **columns
         Other columns, ``(N,)`` or None: ``score``, ``confidence``, ``distance_m``, ``distance_std_m``,
-        ``speed_mps`` and ``speed_std_mps`` of tracks and detections, NaN where a value is unknown;
-        ``time_since_update`` (s) of tracks, which is neither in `columns` nor in files; and
+        ``speed_mps`` and ``speed_std_mps`` of tracks and detections, NaN where a value is unknown; ``label``,
+        the class, ``"vehicle"`` if unknown; ``time_since_update`` (s) of tracks, only in memory; and
         ``occluded`` (0 visible, 1 partly, 2 largely hidden), ``truncated`` (fraction outside the image) and
         ``ignore`` (not scored; with track -1 a region) of labels. A table without ``score`` holds labels.
 
@@ -171,20 +171,31 @@ class TrackTable:
         return table
 
     @classmethod
-    def from_detections(cls, detections: Mapping[FrameKey, Detections]) -> TrackTable:
-        """Collect the detections of each frame, by its key; frames without any count as frames."""
-        check_type(detections, "detections", Mapping, "pass dict(enumerate(detections)) for a list")
+    def from_detections(cls, detections: Mapping[FrameKey, Detections] | Sequence[Detections]) -> TrackTable:
+        """Collect the detections of each frame, by its key; frames without any count as frames.
+
+        The keys of a list are the names of the images' files, or numbers where there are none.
+        """
+        if isinstance(detections, (list, tuple)):
+            paths = [getattr(found, "path", None) for found in detections]
+            names: list[Any] = (
+                [*range(len(paths))] if None in paths else [path.name for path in paths if path]
+            )
+            detections = dict(zip(names if len({*names}) == len(paths) else map(str, paths), detections))
+        check_type(detections, "detections", Mapping, "pass a list, or a dictionary by frame")
         for key, found in detections.items():
             check_type(found, f"detections[{key!r}]", Detections, "pass Detections(boxes, scores)")
         parts = [Detections.empty(), *detections.values()]
         unknown = [np.full(len(found), np.nan) for found in parts]
         known = [gap if each.confidences is None else each.confidences for each, gap in zip(parts, unknown)]
+        kinds = [np.full(len(each), UNKNOWN_LABEL) if each.labels is None else each.labels for each in parts]
         return cls(
             [key for key, found in detections.items() for _ in range(len(found))],
             None,
             np.concatenate([found.boxes for found in parts]),
             score=np.concatenate([found.scores for found in parts]),
             confidence=np.concatenate(known),
+            label=np.concatenate(kinds) if any(each.labels is not None for each in parts) else None,
             frame_keys=tuple(detections),
         )
 
@@ -259,7 +270,8 @@ class TrackTable:
         self._columns["track_id"][new] = [track.id for track in shown]
         if shown:
             self._columns["boxes"][new] = [track.box for track in shown]
-            for name in _APPENDED:
+            self._columns["label"][new] = [getattr(track, "label", UNKNOWN_LABEL) for track in shown]
+            for name in _NUMBERS:
                 # None becomes NaN.
                 values = np.array([getattr(track, name, None) for track in shown], np.float64)
                 self._columns[name][new] = np.where(np.abs(values) < _ABSURD, values, np.nan)
@@ -274,7 +286,7 @@ class TrackTable:
     def _reserve(self, size: int) -> None:
         """Make room for `size` rows; columns double, so that appending takes constant time on average."""
         if not self._keys:
-            self._columns |= {name: np.empty(0) for name in _APPENDED}
+            self._columns |= {name: np.empty(0) for name in _NUMBERS} | {"label": np.empty(0, object)}
             for name in LABEL_COLUMNS:
                 self._columns.pop(name, None)
         if size > len(self._columns["boxes"]):
@@ -296,7 +308,7 @@ class TrackTable:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns that the table has, in the order of the files."""
-        names = [name for name in (*_VALUE_COLUMNS, *LABEL_COLUMNS) if name in self._columns]
+        names = [name for name in (*TRACK_VALUES, *LABEL_COLUMNS) if name in self._columns]
         return ("frame", "track_id", *CORNERS, *names)
 
     @property
@@ -404,13 +416,17 @@ class TrackTable:
     def to_pandas(self) -> pandas.DataFrame:
         """Return a table with one row per box and the columns of the files, NaN where a value is unknown.
 
+        A table that has grown by `append` also has the times of the frames, ``time_s``.
+
         >>> TrackTable([0, 3], [7, 8], [[0, 0, 50, 40], [5, 0, 55, 40]]).to_pandas().iloc[1].to_dict()
         {'frame': 3, 'track_id': 8, 'x1': 5.0, 'y1': 0.0, 'x2': 55.0, 'y2': 40.0, 'occluded': 0, \
 'truncated': 0.0, 'ignore': False}
         """
         import pandas
 
-        return pandas.DataFrame({name: self[name] for name in self.columns})
+        times = self.times()  # of all frames from 0 on
+        more = {} if times is None else {"time_s": times[self["frame"].astype(np.intp)]}
+        return pandas.DataFrame({name: self[name] for name in self.columns} | more)
 
 
 def check_keys(values: object, name: str) -> tuple[FrameKey, ...]:
@@ -431,8 +447,15 @@ def frame_order(key: FrameKey) -> tuple[list[object], str]:
 
 def _check_column(values: ArrayLike | None, name: str, rows: int) -> NDArray[Any]:
     """Check one value per row; returned with the dtype of the column."""
-    column = _COLUMNS[name]
+    column: Any = _COLUMNS[name]
     filled = np.full(rows, column.missing)
+    if name == "label":
+        labels = [UNKNOWN_LABEL] * rows if values is None else np.asarray(values).tolist()
+        if len(labels) != rows or not all(isinstance(label, str) for label in labels):
+            raise InvalidInputError(
+                f"label must be a name for each of the {rows} boxes, got {describe(values)}"
+            )
+        return np.array(labels, object)
     given = filled if values is None else check_array(values, name)
     if given.size == 0:
         given = given.reshape(-1).astype(filled.dtype)
@@ -465,13 +488,15 @@ def parse_cells(
     keys = _parse_frames(cells["frame"], places)
     scores = cells.get("score")
     predicted = scores is not None and (not scores or not all(map(_is_missing, scores)))
-    vehicles, lookalike = _vehicle_rows(cells, source, classes, predicted)
+    vehicles, lookalike, labels = _vehicle_rows(cells, source, classes, predicted)
     rows = np.flatnonzero(vehicles).tolist()
     where = [places[row] for row in rows]
     columns: dict[str, Any] = {}
-    for name in (*CORNERS, *_COLUMNS):
+    if labels is not None:
+        columns["label"] = [labels[row] or UNKNOWN_LABEL for row in rows]
+    for name in (*CORNERS, *(_COLUMNS.keys() - columns.keys())):
         used = "track" if name == "track_id" and name not in cells else name
-        if used in cells and (name != "score" or predicted):
+        if name != "label" and used in cells and (name != "score" or predicted):
             columns[name] = _parse_numbers(used, [cells[used][row] for row in rows], where)
     if lookalike.any():
         columns["ignore"] = columns.get("ignore", False) | lookalike[rows]
@@ -505,20 +530,24 @@ def _parse_frames(cells: Sequence[Any], places: Sequence[str]) -> list[FrameKey]
 
 def _vehicle_rows(
     cells: Mapping[str, Sequence[Any]], source: object, classes: Collection[str] | None, predicted: bool
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Mark the rows to keep, and the labels of lookalikes among them, by the columns of classes."""
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], list[str] | None]:
+    """Mark the rows to keep, and the labels of lookalikes among them, by the columns of classes.
+
+    Also returns the class of each row, None if the file has none. Files of `write_tracks` hold vehicles only.
+    """
     count = len(cells["frame"])
     given = [cells[name] for name in _CLASS_COLUMNS if name in cells]
     names = [next((str(cell).lower() for cell in row if not _is_missing(cell)), "") for row in zip(*given)]
     found = {*names} - {""}
     # Classes that are numbers or flags have no names: all rows are vehicles.
-    if not found or any(re.fullmatch(r"[-\d.]+|true|false", name) for name in found):
-        return np.ones(count, np.bool_), np.zeros(count, np.bool_)
+    known = bool(found) and not any(re.fullmatch(r"[-\d.]+|true|false", name) for name in found)
+    if not known or (classes is None and cells.keys() >= {"score", "confidence", "label"}):
+        return np.ones(count, np.bool_), np.zeros(count, np.bool_), names if known else None
     wanted = VEHICLE_CLASSES if classes is None else classes
     check_classes(source, found, wanted)
     vehicles = np.array([name in wanted for name in names])
     lookalike = ~vehicles & np.isin(names, LOOKALIKE_CLASSES) & (not predicted)
-    return vehicles | lookalike, lookalike
+    return vehicles | lookalike, lookalike, names
 
 
 def check_classes(

@@ -18,9 +18,9 @@ from vehicle_detection.formats import DIGITS, FORMATS, open_tracks, read_labels,
 from vehicle_detection.tables import BOX_COLUMNS, TRACK_COLUMNS, TrackTable
 
 ROWS = [
-    (0, 1, 10.0, 20.0, 50.25, 60.5, 1.5, 31.25, -0.5, 0.9, 2.5, None),
-    (0, 2, 100.0, 20.0, 150.0, 60.0, -0.125, None, None, None, None, None),
-    (2, 1, 12.0, 21.0, 52.0, 61.0, 1.0625, 31.0, 0.0, 0.8, 2.25, 0.5),
+    (0, 1, 10.0, 20.0, 50.25, 60.5, 1.5, 31.25, -0.5, 0.9, 2.5, None, "car"),
+    (0, 2, 100.0, 20.0, 150.0, 60.0, -0.125, None, None, None, None, None, "vehicle"),
+    (2, 1, 12.0, 21.0, 52.0, 61.0, 1.0625, 31.0, 0.0, 0.8, 2.25, 0.5, "car"),
 ]
 NAMES = ("t.csv", "t.jsonl", "t.ndjson", "t.parquet", "t.txt", "t.json")
 
@@ -59,6 +59,7 @@ rows = st.lists(
         st.none() | st.floats(0, 1),
         positive,
         positive,
+        st.sampled_from(["vehicle", "car", "motorcycle", "=bus"]),
     ),
     max_size=8,
     unique_by=lambda row: row[:2],
@@ -73,7 +74,8 @@ def read_csv(path):
 def read_table(path):
     """Read rows back by any reader, None where a value is unknown."""
     if path.suffix == ".csv":
-        return [tuple(None if text == "" else float(text) for text in row.values()) for row in read_csv(path)]
+        table = pd.read_csv(path).astype({"label": str})
+        return [tuple(None if value != value else value for value in row) for row in table.values.tolist()]
     if path.suffix == ".jsonl":
         return [tuple(json.loads(line).values()) for line in path.read_text(encoding="utf-8").splitlines()]
     table = pd.read_parquet(path)
@@ -94,7 +96,9 @@ def test_tables_hold_the_rows(tmp_path_factory, given_rows):
             assert row[:2] == wanted[:2]
             for name, value, want in zip(TRACK_COLUMNS[2:], row[2:], wanted[2:], strict=True):
                 assert (value is None) == (want is None)
-                if want is not None:
+                if name == "label":
+                    assert value.lstrip("'") == want
+                elif want is not None:
                     assert value == pytest.approx(want, abs=0.50001 * 10 ** -DIGITS[name])
         # Written again, what was read is the same file: nothing creeps.
         again = folder / f"again{suffix}"
@@ -105,10 +109,11 @@ def test_tables_hold_the_rows(tmp_path_factory, given_rows):
 def test_csv_to_the_letter(tmp_path):
     assert write_tracks(RESULTS, tmp_path / "tracks.csv") == 3
     assert (tmp_path / "tracks.csv").read_bytes().decode() == (
-        "frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps,confidence,distance_std_m,speed_std_mps\n"
-        "0,1,10.00,20.00,50.25,60.50,1.5000,31.25,-0.50,0.9000,2.50,\n"
-        "0,2,100.00,20.00,150.00,60.00,-0.1250,,,,,\n"
-        "2,1,12.00,21.00,52.00,61.00,1.0625,31.00,0.00,0.8000,2.25,0.50\n"
+        "frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps,confidence,distance_std_m,speed_std_mps,"
+        "label\n"
+        "0,1,10.00,20.00,50.25,60.50,1.5000,31.25,-0.50,0.9000,2.50,,car\n"
+        "0,2,100.00,20.00,150.00,60.00,-0.1250,,,,,,vehicle\n"
+        "2,1,12.00,21.00,52.00,61.00,1.0625,31.00,0.00,0.8000,2.25,0.50,car\n"
     )
 
 
@@ -229,22 +234,24 @@ def test_memory_does_not_grow_with_the_number_of_parquet_rows(tmp_path, monkeypa
 def test_detections_in_images(tmp_path):
     found = TrackTable.from_detections(
         {
-            "road, wet.jpg": Detections([[10, 20, 50, 60], [1, 2, 3, 4]], [1.5, 0.25], [0.82, 0.56]),
+            "road, wet.jpg": Detections(
+                [[10, 20, 50, 60], [1, 2, 3, 4]], [1.5, 0.25], [0.82, 0.56], ["bus", "car"]
+            ),
             "empty.jpg": Detections.empty(),
             'é "quoted".png': Detections([[0, 0, 9.5, 9]], [2]),
         }
     )
     assert write_tracks(found, tmp_path / "b.csv") == 3
     assert (tmp_path / "b.csv").read_text(encoding="utf-8") == (
-        "frame,track_id,x1,y1,x2,y2,score,confidence\n"
-        '"road, wet.jpg",,10.00,20.00,50.00,60.00,1.5000,0.8200\n'
-        '"road, wet.jpg",,1.00,2.00,3.00,4.00,0.2500,0.5600\n'
-        '"é ""quoted"".png",,0.00,0.00,9.50,9.00,2.0000,\n'
+        "frame,track_id,x1,y1,x2,y2,score,confidence,label\n"
+        '"road, wet.jpg",,10.00,20.00,50.00,60.00,1.5000,0.8200,bus\n'
+        '"road, wet.jpg",,1.00,2.00,3.00,4.00,0.2500,0.5600,car\n'
+        '"é ""quoted"".png",,0.00,0.00,9.50,9.00,2.0000,,vehicle\n'
     )
     for name in ("b.jsonl", "b.parquet", "b.json"):
         assert write_tracks(found, tmp_path / name) == 3
     last = json.loads((tmp_path / "b.jsonl").read_text(encoding="utf-8").splitlines()[2])
-    columns = (*BOX_COLUMNS, "confidence")
+    columns = (*BOX_COLUMNS, "confidence", "label")
     assert last == dict(zip(columns, ('é "quoted".png', None, 0.0, 0.0, 9.5, 9.0, 2.0, None)))
     table = pd.read_parquet(tmp_path / "b.parquet")
     assert table["frame"].tolist() == [row["frame"] for row in read_csv(tmp_path / "b.csv")]

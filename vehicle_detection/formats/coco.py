@@ -135,7 +135,7 @@ def read_coco(
         # A crowd is a region, except for the ignored vehicles that are written here, which are marked twice.
         if entry.get("iscrowd") and not (entry.get("ignore") and "track_id" in entry):
             track = NO_TRACK
-        record = {name: entry.get(name) for name in (*TRACK_COLUMNS[6:], "occluded", "truncated")}
+        record = {name: entry.get(name) for name in (*TRACK_COLUMNS[6:-1], "occluded", "truncated")}
         record |= {"frame": frame, "track_id": track, "ignore": ignore}
         rows.append((where, record | dict(zip(CORNERS, (x, y, x + width, y + height)))))
     return rows, list(file.images.values())
@@ -208,7 +208,7 @@ def _result(record: Record, truth: Truth | None) -> Record:
     x1, y1, x2, y2 = (record[name] for name in CORNERS)
     result: Record = {"image_id": image["id"], "category_id": 1 if truth is None else truth.category}
     result["bbox"] = [x1, y1, without_noise(x2 - x1), without_noise(y2 - y1)]
-    known = {name: record.get(name) for name in ("score", "track_id", *TRACK_COLUMNS[7:])}
+    known = {name: record.get(name) for name in ("score", "track_id", *TRACK_COLUMNS[7:-1])}
     known |= {"track_id": None} if known["track_id"] == NO_TRACK else {}
     return result | {name: value for name, value in known.items() if value is not None}
 

@@ -41,12 +41,12 @@ from vehicle_detection.formats.coco import (
 from vehicle_detection.formats.read import FOLDER_FORMATS, FORMATS
 from vehicle_detection.formats.rows import FRAME_NUMBER, Record, without_suffix
 from vehicle_detection.tables import BOX_COLUMNS, CORNERS, NO_TRACK, TRACK_COLUMNS, FrameKey, TrackTable
-from vehicle_detection.tracking import is_result, shown_tracks
+from vehicle_detection.tracking import TRACK_VALUES, UNKNOWN_LABEL, is_result, shown_tracks
 
 TIME_COLUMN = "time_s"
-DIGITS = dict(zip((*TRACK_COLUMNS[2:], TIME_COLUMN), (2, 2, 2, 2, 4, 2, 2, 4, 2, 2, 3)))
+DIGITS = dict(zip((*TRACK_COLUMNS[2:-1], TIME_COLUMN), (2, 2, 2, 2, 4, 2, 2, 4, 2, 2, 3)))
 """Decimals of each column of a table of tracks."""
-STILL_COLUMNS = (*BOX_COLUMNS, "confidence")
+STILL_COLUMNS = (*BOX_COLUMNS, "confidence", "label")
 
 _TRACK_FORMATS = (*dict.fromkeys(FORMATS.values()), "yolo")
 _STILL_FORMATS = ("csv", "jsonl", "parquet", "coco", "yolo")
@@ -74,9 +74,10 @@ def track_records(result: Any) -> list[Record]:
     for track in shown_tracks(result.tracks):
         record: Record = {"frame": int(result.index), "track_id": int(track.id)}
         record |= zip(CORNERS, map(float, track.box))
-        for name in TRACK_COLUMNS[6:]:
+        for name in TRACK_VALUES[:-1]:
             value = getattr(track, name, None)
             record[name] = None if value is None or math.isnan(value) else float(value)
+        record["label"] = getattr(track, "label", UNKNOWN_LABEL)
         records.append(_round(record))
     return records
 
@@ -139,7 +140,7 @@ def _open_json_lines(part: Path, target: _Target) -> Iterator[Write]:
 @contextlib.contextmanager
 def _open_parquet(part: Path, target: _Target) -> Iterator[Write]:
     types = {"frame": "string" if target.named else "int64", "track_id": "int64", "occluded": "int64"}
-    types["ignore"] = "bool"
+    types |= {"ignore": "bool", "label": "string"}
     with open_parquet(part, {name: types.get(name, "double") for name in target.columns}) as write:
         yield lambda _, records: write(records)
 
@@ -347,7 +348,7 @@ def open_tracks(
     ...         tracks = tracker.update(found, (720, 1280, 3))
     ...         write(FrameResult(frame, frame / 25, found, found, tracks))
     >>> print(file.read_text().splitlines()[0])
-    frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps,confidence,distance_std_m,speed_std_mps
+    frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps,confidence,distance_std_m,speed_std_mps,label
     """
     kind = _check_format(path, format, _TRACK_FORMATS)
     rate = None if fps is None else check_number(fps, "fps", above=0, high=1e6)
@@ -388,8 +389,9 @@ def write_tracks(
     -----
     ``frame`` counts from 0, the first processed frame; boxes are half-open pixels with two decimals.
     Unknown values are empty in CSV and null elsewhere. The score is the log-odds above the threshold, the
-    confidence a calibrated probability; speeds are relative to the camera. Detections of images have the
-    columns up to ``score``, and ``confidence``. The archive for CVAT holds labels to correct, without scores.
+    confidence a calibrated probability; speeds are relative to the camera. The label is the class,
+    ``vehicle`` if the model does not tell kinds apart. Detections of images have the columns up to ``score``,
+    ``confidence`` and ``label``. The archive for CVAT holds labels to correct, without scores.
 
     Examples
     --------
@@ -399,8 +401,8 @@ def write_tracks(
     >>> write_tracks(TrackTable([0], [1], [[10, 20, 50.128, 60]], score=[1.5], distance_m=[31.4]), file)
     1
     >>> print(file.read_text().rstrip())
-    frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps,confidence,distance_std_m,speed_std_mps
-    0,1,10.00,20.00,50.13,60.00,1.5000,31.40,,,,
+    frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps,confidence,distance_std_m,speed_std_mps,label
+    0,1,10.00,20.00,50.13,60.00,1.5000,31.40,,,,,vehicle
     """
     if not isinstance(results, TrackTable):
         if isinstance(results, Mapping) or not is_listing(results):

@@ -8,10 +8,20 @@ from vehicle_detection.tracking.interpolation import (
     search_interval,
 )
 from vehicle_detection.tracking.scene_cuts import SceneCuts
-from vehicle_detection.tracking.track import FrameResult, Track, TrackParams, is_result, shown_tracks
+from vehicle_detection.tracking.track import (
+    TRACK_VALUES,
+    UNKNOWN_LABEL,
+    FrameResult,
+    Track,
+    TrackParams,
+    is_result,
+    shown_tracks,
+)
 from vehicle_detection.tracking.tracker import Tracker
 
 __all__ = [
+    "TRACK_VALUES",
+    "UNKNOWN_LABEL",
     "FrameResult",
     "HorizonEstimate",
     "SceneCuts",

@@ -7,7 +7,7 @@ import time as clock
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,13 @@ from vehicle_detection._common import Checked, Floats, describe, integer, number
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 
+if TYPE_CHECKING:
+    import pandas
+
+TRACK_VALUES = ("score", "distance_m", "speed_mps", "confidence", "distance_std_m", "speed_std_mps", "label")
+"""What tables state of a track besides its id and box, in the order of their columns."""
+UNKNOWN_LABEL = "vehicle"
+"""Class of a vehicle whose kind is unknown."""
 TIME_TOLERANCE = 1e-6
 """Float tolerance in seconds when comparing summed frame times with a limit."""
 
@@ -127,6 +134,8 @@ class Track:
     distance_m, distance_std_m, speed_mps, speed_std_mps
         Distance along the road in meters, and speed relative to the camera in meters per second, positive
         when moving away, with their standard errors; None where they are unknown.
+    label
+        Class of most of its detections, ``"vehicle"`` if the model does not tell kinds apart.
 
     Examples
     --------
@@ -151,6 +160,12 @@ class Track:
     distance_std_m: float | None = None
     speed_mps: float | None = None
     speed_std_mps: float | None = None
+    label: str = UNKNOWN_LABEL
+
+    @property
+    def name(self) -> str:
+        """Class, if known, and id, such as ``"car #3"``."""
+        return f"#{self.id}" if self.label == UNKNOWN_LABEL else f"{self.label} #{self.id}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -207,12 +222,28 @@ class FrameResult:
         shown = f"{pluralize(len(self.shown), 'vehicle')} shown"
         return f"{type(self).__name__}({self.index}{time}: {found}, {shown})"
 
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a table of the shown tracks: the rows of this frame in `TrackRun.to_pandas`."""
+        import pandas
+
+        rows = [
+            (self.index, track.id, *track.box.tolist(), *(getattr(track, name) for name in TRACK_VALUES))
+            for track in self.shown
+        ]
+        data = pandas.DataFrame(rows, columns=["frame", "track_id", "x1", "y1", "x2", "y2", *TRACK_VALUES])
+        numbers = dict.fromkeys((*data.columns[2:6], *TRACK_VALUES[:-1]), float)
+        return data.astype(numbers | {"frame": int, "track_id": int}).assign(time_s=self.time)
+
     def to_supervision(self) -> Any:
-        """Convert the shown tracks to ``supervision.Detections`` with their ids as ``tracker_id``."""
+        """Convert the shown tracks to ``supervision.Detections`` with their ids as ``tracker_id``.
+
+        The classes are numbers in no order of a model; their names are in ``data["class_name"]``.
+        """
         boxes = np.array([track.box for track in self.shown]).reshape(-1, 4)
         confidences = [track.confidence for track in self.shown]
         known = None if None in confidences else np.array(confidences, np.float64)
-        found = Detections(boxes, np.array([track.score for track in self.shown]), known)
+        labels = [track.label for track in self.shown]
+        found = Detections(boxes, np.array([track.score for track in self.shown]), known, labels)
         return found.to_supervision(tracker_id=[track.id for track in self.shown])
 
 
@@ -244,6 +275,7 @@ class TrackState:
     hidden: bool = False  # whether another vehicle explains the missing detection
     covered: float = 0.0  # fraction of its box that nearer vehicles cover
     lost: bool = False  # whether its predicted position is only a guess
+    votes: Counter[str] = field(default_factory=Counter)  # number of detections of each class
 
     def __post_init__(self) -> None:
         self.mean_score = self.score / self.weight
@@ -254,6 +286,11 @@ class TrackState:
         if not self.id:
             return "tentative"
         return "coasting" if self.misses else "confirmed"
+
+    @property
+    def label(self) -> str:
+        """Class of most of its detections."""
+        return max(self.votes, key=self.votes.__getitem__, default=UNKNOWN_LABEL)
 
     @property
     def shown(self) -> bool:

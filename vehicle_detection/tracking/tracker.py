@@ -10,6 +10,7 @@ frame.
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from dataclasses import replace
@@ -184,33 +185,33 @@ class Tracker:
         dt = self._advance(frame, time, check_integer(frames, "frames", low=1))
         if dt == 0:
             return self._tracks
-        boxes, scores = _sorted_inside(detections, frame)
-        used = scores >= min(self.params.high_threshold, self.params.low_threshold)
-        boxes, scores = self._limit(boxes[used], scores[used])
-        unassigned = np.ones(len(boxes), np.bool_)
+        found = _sorted_inside(detections, frame)
+        used = found.scores >= min(self.params.high_threshold, self.params.low_threshold)
+        found = self._limit(found[used])
+        unassigned = np.ones(len(found), np.bool_)
         if self._live:
             coasting = np.array([track.misses > 0 for track in self._live])
             states = self._smoother.predict(self._states, coasting, dt)
             self._states = predict_distances(states, dt, self.camera)
-            unassigned = self._correct(boxes, scores, frame, dt)
+            unassigned = self._correct(found, frame, dt)
             self._end_lost_tracks(frame, dt)
             self._end_parts(frame)
-        self._start(boxes[unassigned], scores[unassigned], frame, dt)
+        self._start(found[unassigned], frame, dt)
         self._confirm(frame)
         self._update_horizon(frame, dt)
         self._tracks, self._at_start = self._snapshot(frame, self._states), False
         return self._tracks
 
-    def _limit(self, boxes: Floats, scores: Floats) -> tuple[Floats, Floats]:
+    def _limit(self, found: Detections) -> Detections:
         """Keep the best detections of a frame that has too many, and warn of the first such frame."""
-        if len(boxes) > _MAX_DETECTIONS and not self._warned:
+        if len(found) > _MAX_DETECTIONS and not self._warned:
             self._warned = True
             warnings.warn(
-                f"a frame has {len(boxes)} detections; the {_MAX_DETECTIONS} best of a frame are tracked: "
+                f"a frame has {len(found)} detections; the {_MAX_DETECTIONS} best of a frame are tracked: "
                 "raise the threshold of the detector",
                 stacklevel=3,
             )
-        return boxes[:_MAX_DETECTIONS], scores[:_MAX_DETECTIONS]
+        return found[:_MAX_DETECTIONS]
 
     def predict(self, *, time: float | None = None, frames: int = 1) -> tuple[Track, ...]:
         """Estimate where the confirmed tracks will be, without changing the state of the tracker.
@@ -260,13 +261,16 @@ class Tracker:
         self._time, self._shape = now, frame
         return dt
 
-    def _correct(self, boxes: Floats, scores: Floats, frame: FrameShape, dt: float) -> NDArray[np.bool_]:
+    def _correct(self, found: Detections, frame: FrameShape, dt: float) -> NDArray[np.bool_]:
         """Correct the tracks by their detections; return which detections belong to no track."""
+        boxes, scores = found.boxes, found.scores
         unassigned = np.ones(len(boxes), np.bool_)
         own, shared, merged = self._assign(boxes, scores, frame)
         for row, track in enumerate(self._live):
             track.update_score(float(scores[own[row]]) if row in own else None, dt, self.params)
             track.hidden = row in shared
+            if row in own and found.labels is not None:
+                track.votes[str(found.labels[own[row]])] += 1
         source = shared | own
         if not source:
             return unassigned
@@ -388,8 +392,9 @@ class Tracker:
         self._live = [self._live[row] for row in rows]
         self._states = self._states.take(rows)
 
-    def _start(self, boxes: Floats, scores: Floats, frame: FrameShape, dt: float) -> None:
+    def _start(self, found: Detections, frame: FrameShape, dt: float) -> None:
         """Start a tentative track at each high-score detection that shows no tracked vehicle."""
+        boxes, scores = found.boxes, found.scores
         high = int((scores >= self.params.high_threshold).sum())
         visible = [row for row, track in enumerate(self._live) if track.misses == 0 or track.shown]
         known = _clip(self._states.boxes()[visible], frame)
@@ -403,9 +408,11 @@ class Tracker:
         correlation = self.params.measurement_correlation_time
         self._states = self._states.join(update_distances(states, measured, self.camera, dt, correlation))
         weight = weight_of(dt, self.params)
-        for score in scores[rows].tolist():
+        labels = [] if found.labels is None else found.labels[rows].tolist()
+        for score, label in itertools.zip_longest(scores[rows].tolist(), labels):
             confirm_at_birth = self._at_start and score >= self.params.instant_confirm_score
             track = TrackState(score * weight, weight, confirm_at_birth=confirm_at_birth, key=self._next_key)
+            track.votes.update([label] if label else [])
             self._live.append(track)
             self._next_key += 1
 
@@ -444,7 +451,7 @@ class Tracker:
             confidences = self._calibration.probability(scores).tolist()
         velocities = map(tuple, states.mean[:, 4:6].tolist())
         ranges = estimate_distances(states, gap, self.camera)
-        names = ("id", "key", "score", "state", "shown", "age", "misses", "time_since_update")
+        names = ("id", "key", "score", "state", "shown", "age", "misses", "time_since_update", "label")
         tracks = []
         for track, box, velocity, confidence, estimate in zip(live, boxes, velocities, confidences, ranges):
             life = {name: getattr(track, name) for name in names}
@@ -452,12 +459,12 @@ class Tracker:
         return tuple(tracks)
 
 
-def _sorted_inside(detections: Detections, frame: FrameShape) -> tuple[Floats, Floats]:
-    """Boxes and scores inside the frame, best score first and then the largest, in any order of the input."""
+def _sorted_inside(detections: Detections, frame: FrameShape) -> Detections:
+    """Clip detections to the frame, best score first and then the largest, in any order of the input."""
     boxes = _clip(detections.boxes.astype(np.float64), frame)
     order = np.lexsort((*boxes.T, -box_areas(boxes), -detections.scores))
     order = order[(boxes[order, 2:] - boxes[order, :2] >= 1).all(axis=1)]
-    return boxes[order], detections.scores[order]
+    return detections.with_columns(boxes=boxes)[order]
 
 
 def _clip(boxes: Floats, frame: FrameShape) -> Floats:

@@ -17,7 +17,7 @@ from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ from vehicle_detection._common import (
     single_threaded_opencv,
 )
 from vehicle_detection.errors import DetectorError, InvalidInputError
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.tracking import (
     FrameResult,
     SceneCuts,
@@ -46,6 +47,9 @@ from vehicle_detection.video.opening import Source, borrow_source
 from vehicle_detection.video.queues import ClosableQueue, QueueClosed
 from vehicle_detection.video.reading import AudioSource, Reader, check_span, frame_range
 from vehicle_detection.video.sources import FrameSource
+
+if TYPE_CHECKING:
+    import pandas
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -385,6 +389,14 @@ class TrackRun(Closing):
         minutes, seconds = divmod(int(frames / self.info.fps), 60)
         return f"{minutes}:{seconds:02d}"
 
+    def to_pandas(self) -> pandas.DataFrame:
+        """Process the source to its end; return a row per frame and shown track, as in files, and ``time_s``.
+
+        Frame by frame, in constant memory, ``result.to_pandas()`` of each result returns the same rows.
+        """
+        with self:
+            return TrackTable.from_results(self).to_pandas()
+
     def sound(self) -> AudioSource | None:
         """Return the sound of the frames; None if there is none."""
         return self.source.audio(self._first, self._end)
@@ -476,6 +488,8 @@ def track(
     ...     print(result.index, result.time, result.frame.shape, len(result.detections))
     0 0.0 (720, 1280, 3) 2
     1 0.04 (720, 1280, 3) 4
+    >>> track("test_images/*.jpg", "highway", end=0.08).to_pandas()[["frame", "track_id", "time_s"]].shape
+    (2, 3)
     """
     check_flags(frames=frames, progress=progress)
     start, end = check_span(start, end)
