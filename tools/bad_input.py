@@ -55,7 +55,8 @@ NOT_CALLED = {
 
 RESULTS = {
     "BatchReport", "BatchStatus", "DetectionScores", "DistanceScores", "Event", "Explanation", "FrameResult",
-    "FrameSet", "FrameSource", "HorizonEstimate", "NetworkModel", "SearchResult", "Track", "TrackScores",
+    "FrameSet", "FrameSource", "HorizonEstimate", "ImageDetections",
+    "NetworkModel", "SearchResult", "Track", "TrackScores",
     "TrackRun", "TrainingReport", "Trip", "VehicleCounts", "VideoInfo", "VideoReport",
     "notebook.ImageDescription",
 }  # fmt: skip
@@ -150,7 +151,8 @@ def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
 INTERNAL = {
     "Event.text", "FeatureParams.spatial_planes", "FrameResult.unsearched", "FrameSource.audio",
     "FrameSource.read", "HeatParams.for_search", "NetworkModel.feeds", "NetworkModel.input_size_for",
-    "NetworkModel.network_probability", "NetworkModel.scores", "NetworkModel.with_confidence",
+    "NetworkModel.name_classes", "NetworkModel.network_probability", "NetworkModel.scores",
+    "NetworkModel.with_confidence",
     "RegionParams.with_peak", "SearchBand.place", "SearchParams.place", "TrackTable.select",
 }  # fmt: skip
 """Methods that only the library calls, with its own results."""

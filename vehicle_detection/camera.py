@@ -39,6 +39,7 @@ from vehicle_detection._common import (
     flag,
     number,
     read_regular_file,
+    suggest_keywords,
     write_text,
 )
 from vehicle_detection.boxes import Detections
@@ -208,6 +209,7 @@ class Camera(Checked):
         return cls(focal_px=focal, horizon_px=horizon * height, height_m=height_m, shape=size, **known)
 
     @classmethod
+    @suggest_keywords
     def dashcam(
         cls,
         *,
@@ -364,6 +366,7 @@ def _fisheye_radius(angle: Floats, k1: float, k2: float) -> Floats:
     return angle * (1 + k1 * angle**2 + k2 * angle**4)
 
 
+@suggest_keywords
 def open_camera(
     camera: Camera | str | os.PathLike[str] | None = None,
     *,

@@ -26,6 +26,7 @@ from vehicle_detection._common import (
     check_type,
     describe,
     pluralize,
+    suggest_keywords,
 )
 from vehicle_detection.annotator import Annotator
 from vehicle_detection.boxes import Detections, Platt
@@ -168,6 +169,7 @@ class Detector(Closing):
     Detections(0 boxes)
     """
 
+    @suggest_keywords
     def __init__(
         self,
         model: Path | Model = "default",
@@ -322,6 +324,7 @@ def _shared_detector(model: str) -> Detector:
     return Detector(model)
 
 
+@suggest_keywords
 def detect(image: Any, model: Path | Model = "default", *, conf: float | None = None) -> Any:
     """Detect the vehicles of images in one line, as `Detector.detect`.
 
@@ -390,6 +393,7 @@ class VehicleDetector(Closing):
     (0, 0)
     """
 
+    @suggest_keywords
     def __init__(
         self,
         model: Path | Model | Detector = "default",

@@ -185,10 +185,10 @@ def test_read_only_folders_are_refused(monkeypatch, material, clip, picture, tmp
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["detcet"], r"No such command 'detcet'.*; see \S+ --help"),
+        (["detcet"], r"No such command 'detcet'; use detect; see \S+ --help"),
         (["--fast"], r"No such option: --fast; see \S+ --help"),
         (["detect", "--fast"], r"No such option: --fast; see \S+ detect --help"),
-        (["detect"], r"Missing argument 'IMAGE...'; see \S+ detect --help"),
+        (["detect"], r"Missing argument 'IMAGE...'; IMAGE...: .*; see \S+ detect --help"),
         (["video", "a.mp4", "--jobs", "many"], r"Invalid value for '--jobs': .* a valid integer; .*"),
         (
             ["video", *(f"CARD/{number}.MP4" for number in range(1000))],

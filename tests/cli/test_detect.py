@@ -39,9 +39,9 @@ def test_detect_writes_annotated_images_and_boxes(monkeypatch, picture, tmp_path
         f"wrote {folder}",
     ]
     assert boxes.read_text().splitlines() == [
-        f"{HEADER},confidence",
-        "road.png,,10.00,20.00,60.40,70.00,1.5000,0.8200",
-        "road.png,,100.00,50.00,180.00,120.00,0.2500,0.5640",
+        f"{HEADER},confidence,label",
+        "road.png,,10.00,20.00,60.40,70.00,1.5000,0.8200,vehicle",
+        "road.png,,100.00,50.00,180.00,120.00,0.2500,0.5640,vehicle",
     ]
     assert contents(tmp_path / "new") == ["out", "out/other.jpg", "out/road.png"]
     changed = (read_image(folder / "road.png") != read_image(picture)).any(axis=2)
@@ -57,7 +57,7 @@ def test_detect_keeps_boxes_of_a_minimum_confidence(tmp_path):
     for conf in (0.1, 0.999):
         succeed("detect", tmp_path / "road.png", "--conf", conf, "--boxes", tmp_path / "boxes.csv")
         rows = (tmp_path / "boxes.csv").read_text().splitlines()[1:]
-        assert all(float(row.split(",")[-1]) >= conf for row in rows)
+        assert all(float(row.split(",")[-2]) >= conf for row in rows)
         counts[conf] = len(rows)
     assert counts[0.1] > counts[0.999]
 
@@ -94,6 +94,17 @@ def test_patterns_of_images_are_expanded_and_each_image_searched_once(picture, t
     assert "[a].png does not exist; check the path" in refuse("detect", tmp_path / "[a].png")
 
 
+def test_folders_are_searched_and_distances_stated_with_a_lens(picture, tmp_path):
+    for name in ("a/1.png", "b/1.png"):
+        (tmp_path / "in" / name).parent.mkdir(parents=True, exist_ok=True)
+        write_image(tmp_path / "in" / name, road((14, 0), (34, 3.6), shape=(360, 640), random_state=3).image)
+    words = "--fov", 58, "--horizon", 0.5, "-o", tmp_path / "out", "--boxes", tmp_path / "boxes.csv"
+    out = succeed("detect", tmp_path / "in", *words)
+    assert len(re.findall(r"\d% \d+ ± \d+ m", out)) >= 2
+    assert contents(tmp_path / "out") == ["a", "a/1.png", "b", "b/1.png"]
+    assert "b/1.png" in (tmp_path / "boxes.csv").read_text()
+
+
 def test_a_damaged_but_readable_image_gives_a_warning(picture, tmp_path):
     write_image(tmp_path / "road.jpg", read_image(picture))
     data = bytearray((tmp_path / "road.jpg").read_bytes())
@@ -107,7 +118,7 @@ def test_a_damaged_but_readable_image_gives_a_warning(picture, tmp_path):
 BAD_IMAGES = {
     "{road} --blur plates": "--output must name a folder for --blur",
     "missing.png": "IMAGE missing.png does not exist; check the path",
-    "{material}/empty": "IMAGE .+empty is a folder; choose files in it",
+    "{material}/empty": "IMAGE .+empty holds no image file",
     "{material}/clip.mp4": "clip.mp4 is a video; use vehicle-detection video",
     "{material}/text.png": "text.png must be a complete image file",
     "{material}/cut_road.png": "cut_road.png must be a complete image file",

@@ -236,10 +236,11 @@ BAD_VIDEOS = {
     "{clip} -o out.mp4 --tracks none/t.csv": "--tracks needs an existing folder",
     "{clip} -o out.mp4 --report page.pdf": "--report must end in .html or .htm, got 'page.pdf'",
     "{clip} -o out.mp4 --report out.mp4": "--report .+ is also --output .+;",
-    "{clip} --report r.html": "--output must name a video for --report, .* add it",
-    "{clip} --show --clips clips": "--output must name a video for --clips, .* add it",
+    "http://host/a.mp4 --report r.html": "--output must name a video for --report, .* add it",
+    "0 --show --clips clips": "--output must name a video for --clips, .* add it",
     "{clip} --tracks t.csv --blur plates": "--output must name a video for --blur",
-    "{clip}": "--output must name the video to write; or use --show",
+    "0": "--output must name the video to write; or use --show",
+    "nothing.mp4": "nothing.mp4 does not exist",
     "{clip} -o out.mp4 --blur faces": "--blur must be one of 'vehicles', 'plates'; got 'faces'",
     "{clip} -o out.mp4 --events e.txt": "--events must end in .csv or .json, got 'e.txt'",
     "{clip} -o out.mp4 --own-speed -1": "--own-speed must be a speed of at most 500",
@@ -336,3 +337,19 @@ def test_own_speed_in_units(text, mps):
 def test_own_speed_that_cannot_be_read(text):
     with pytest.raises(InvalidInputError, match="--own-speed must be a speed of at most 500, such as 100"):
         read_speed(text, None, 0.0)
+
+
+def test_the_copy_is_named_after_its_source_and_replaces_no_file(clip, tmp_path):
+    source = tmp_path / "drive.mp4"
+    shutil.copy(clip, source)
+    (tmp_path / "other").mkdir()
+    for words, written in (
+        ((), "drive_tracked.mp4"),
+        ((), "drive_tracked_2.mp4"),
+        (("--report", tmp_path / "r.html"), "drive_tracked_3.mp4"),
+        (("-o", tmp_path / "other"), "other/drive_tracked.mp4"),
+    ):
+        assert f"wrote {tmp_path / written}" in succeed("video", source, "--end", 0.1, *words)
+    before = contents(tmp_path)
+    succeed("video", source, "--end", 0.1, "--tracks", tmp_path / "t.csv")
+    assert contents(tmp_path) == sorted([*before, "t.csv"])

@@ -276,7 +276,7 @@ class TestSettingsAndModel:
             model = dataclasses.replace(shipped, metadata=metadata)
         text = write_report(tmp_path, FRAMES, detector=SimpleNamespace(model=model))
         StrictParser(text)
-        assert "License: the model inherits the terms of the data it was trained on." in text
+        assert "the weights have the terms of the data they were trained on." in text
         assert "<i>" not in text
 
     @pytest.mark.parametrize("model", [None, SimpleNamespace(summary=print)])

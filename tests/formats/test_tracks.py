@@ -252,7 +252,7 @@ def test_detections_in_images(tmp_path):
         assert write_tracks(found, tmp_path / name) == 3
     last = json.loads((tmp_path / "b.jsonl").read_text(encoding="utf-8").splitlines()[2])
     columns = (*BOX_COLUMNS, "confidence", "label")
-    assert last == dict(zip(columns, ('é "quoted".png', None, 0.0, 0.0, 9.5, 9.0, 2.0, None)))
+    assert last == dict(zip(columns, ('é "quoted".png', None, 0.0, 0.0, 9.5, 9.0, 2.0, None, "vehicle")))
     table = pd.read_parquet(tmp_path / "b.parquet")
     assert table["frame"].tolist() == [row["frame"] for row in read_csv(tmp_path / "b.csv")]
     assert table["track_id"].isna().all()

@@ -37,8 +37,9 @@ from vehicle_detection._common.files import (
     temporary_folder,
     write_text,
 )
+from vehicle_detection._common.keywords import suggest_keywords
 from vehicle_detection._common.limits import Limit, check_environment, check_regular_file, read_regular_file
-from vehicle_detection._common.model_file import FORMAT_VERSION, read_model, write_model
+from vehicle_detection._common.model_file import FORMAT_VERSION, model_terms, read_model, write_model
 from vehicle_detection._common.parquet import import_pyarrow, open_parquet
 from vehicle_detection._common.progress import in_notebook, progress_bar
 from vehicle_detection._common.signals import postpone

@@ -163,3 +163,16 @@ def _parse(data: bytes, name: str, kind: str) -> ModelData:
         return ModelData(name, str(header["kind"]), dict(params), dict(metadata), tensors)
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ModelFileError(f"{name} has no readable parameters ({error}); download it again") from error
+
+
+def model_terms(metadata: Mapping[str, Any]) -> str:
+    """State the terms of a model's weights, which are those of its training data, in one sentence."""
+    data = metadata.get("data")
+    inner = data.get("sources") if isinstance(data, Mapping) else None
+    sources = [*data, *(inner or ())] if isinstance(data, Mapping) else []
+    if any(str(name).startswith(("GTI", "KITTI", "bdd")) for name in sources):
+        return (
+            "the code is MIT; these weights are for non-commercial use only, with attribution, because of "
+            "their training data (see the model card); train weights of your own on other data"
+        )
+    return "the code is MIT; the weights have the terms of the data they were trained on"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import textwrap
 from collections.abc import Iterator
 from typing import Annotated, Any
@@ -21,6 +22,7 @@ from vehicle_detection.cli.batch import batch
 from vehicle_detection.cli.demo import demo
 from vehicle_detection.cli.detect import detect
 from vehicle_detection.cli.evaluate import evaluate
+from vehicle_detection.cli.hints import hint_command, hint_option, hint_value
 from vehicle_detection.cli.info import info
 from vehicle_detection.cli.output import (
     exit_if_abandoned,
@@ -51,7 +53,10 @@ def _print_usage_error() -> Iterator[None]:
     except _UsageError as error:
         if type(error).__name__ == "NoArgsIsHelpError":
             raise
-        message = " ".join(error.format_message().split()).rstrip(".")
+        message = " ".join(error.format_message().split()).rstrip(".").partition(", unable to parse")[0]
+        hint = _find_hint(error)
+        if hint:  # a better one
+            message = re.sub(r" \(Possible options:.*?\)| Did you mean .*", "", message).rstrip(".")
         command = "vehicle-detection" if error.ctx is None else error.ctx.command_path
         if "unexpected extra argument" in message and command.endswith(" video"):
             # Such as the files of a pattern that the shell has expanded, of which there may be thousands.
@@ -60,8 +65,21 @@ def _print_usage_error() -> Iterator[None]:
                 "; SOURCE is one argument: for several files, pass their folder or a quoted pattern, such as "
                 "'CARD/*.MP4'"
             )
-        print_error(f"error: {message.partition(', unable to parse')[0]}; see {command} --help")
+        print_error(f"error: {'; '.join(filter(None, (message, hint)))}; see {command} --help")
         raise typer.Exit(BAD_INPUT) from None
+
+
+def _find_hint(error: Any) -> str:
+    """Return what to write instead of the wrong command, option or value."""
+    context, param = error.ctx, getattr(error, "param", None)
+    if context is None:
+        return ""
+    if param is not None:
+        return hint_value(param)
+    if hasattr(error, "option_name"):
+        return hint_option(error.option_name, context.command.params)
+    found = re.match(r"No such command '(.*?)'", error.format_message())
+    return hint_command(found[1], context.command.list_commands(context)) if found else ""
 
 
 def _is_folder_gone() -> bool:

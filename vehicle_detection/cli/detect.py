@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import glob
 import itertools
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import typer
 from typer import Argument
@@ -17,7 +16,14 @@ from typer import Argument
 import vehicle_detection as vd
 from vehicle_detection.cli import options as shared
 from vehicle_detection.cli.horizon import is_limited, search_everywhere, warn_of_horizon
-from vehicle_detection.cli.options import check_blur, drawing_option, open_model, output_option, takes
+from vehicle_detection.cli.options import (
+    camera_option,
+    check_blur,
+    drawing_option,
+    open_model,
+    output_option,
+    takes,
+)
 from vehicle_detection.cli.output import (
     DAMAGED,
     announce_replaced,
@@ -32,11 +38,30 @@ from vehicle_detection.errors import InvalidInputError
 _CHECKED_IMAGES = 20  # images that are searched again if no vehicle was found
 
 
+_FOV = camera_option(
+    None, "DEG", "Field of view along the longer side in degrees, such as 90, to state distances."
+)
+
+
+class _Image(NamedTuple):
+    """An image to search: its file or URL, and the name by which results know it."""
+
+    source: Any
+    name: str
+
+    def __str__(self) -> str:
+        from vehicle_detection._common import hide_credentials
+
+        return hide_credentials(str(self.source))
+
+
 @dataclass(frozen=True, kw_only=True)
 class DetectOptions:
     """Options of ``detect``."""
 
-    images: list[Path] = Argument(..., metavar="IMAGE...", help="Image files, such as frames/*.jpg.")
+    images: list[str] = Argument(
+        ..., metavar="IMAGE...", help="Image files, such as frames/*.jpg; folders; URLs."
+    )
     output: Path | None = output_option(
         None, "DIR", "Folder for annotated images, such as found.", "-o", "--output"
     )
@@ -50,6 +75,9 @@ class DetectOptions:
     classes: str | None = shared.CLASSES
     device: str = shared.DEVICE
     conf: float | None = shared.CONFIDENCE
+    camera: str | None = shared.CAMERA
+    fov: float | None = _FOV
+    camera_height: float | None = shared.CAMERA_HEIGHT
     horizon: float | None = shared.HORIZON
     labels: str = drawing_option("score", "score|none", "Labels of the boxes in annotated images.")
     line_width: int | None = shared.LINE_WIDTH
@@ -64,11 +92,14 @@ def detect(options: DetectOptions) -> None:
     """
     from vehicle_detection._common import encodable
 
-    images = list(dict.fromkeys(itertools.chain.from_iterable(map(_expand, options.images))))
+    with option_names(image="IMAGE", path="IMAGE"):
+        images = list(dict.fromkeys(itertools.chain.from_iterable(map(_expand, options.images))))
     _check(options, images)
-    left_out: list[Path] = []
+    left_out: list[_Image] = []
     loaded = open_model(options.model, options.classes, options.device)
-    camera = vd.Camera.dashcam(horizon=options.horizon)
+    camera = vd.open_camera(
+        options.camera, fov=options.fov, height_m=options.camera_height, horizon=options.horizon
+    )
     with (
         vd.Detector(loaded, conf=options.conf, camera=camera) as detector,
         output_folder(options.output, "--output"),
@@ -77,7 +108,7 @@ def detect(options: DetectOptions) -> None:
         announce_replaced([options.boxes])
         found = _detect_each(images, detector, options, left_out)
         if options.horizon is not None:
-            readable = (path for path in images if path not in left_out)
+            readable = (image for image in images if image not in left_out)
             found = _warn_if_empty(found, readable, detector, options.horizon)
         if options.boxes is None:
             deque(found, maxlen=0)
@@ -93,15 +124,22 @@ def detect(options: DetectOptions) -> None:
         raise typer.Exit(DAMAGED)
 
 
-def _expand(image: Path) -> list[Path]:
-    """List the files of a pattern with ``*`` or ``?``, which the shell of Windows passes on as it is."""
-    if image.exists():
-        return [image]
-    found = map(Path, sorted(glob.glob(str(image).replace("[", "[[]"))))
-    return [path for path in found if not path.is_dir()] or [image]
+def _expand(text: str) -> list[_Image]:
+    """List the images of a folder, or of a pattern, which the shell of Windows passes on as it is."""
+    from vehicle_detection._common import is_url
+    from vehicle_detection.images import list_images
+
+    path = Path(text)
+    if is_url(text):
+        return [_Image(text, path.name.partition("?")[0] or "image")]
+    has_pattern = ("*" in text or "?" in text) and not path.exists()
+    if not path.is_dir() and not has_pattern:
+        return [_Image(path, path.name)]
+    found = list_images(path if path.is_dir() else text.replace("[", "[[]")) or ()
+    return [_Image(each, str(each.relative_to(path) if path.is_dir() else each.name)) for each in found]
 
 
-def _check(options: DetectOptions, images: list[Path]) -> None:
+def _check(options: DetectOptions, images: list[_Image]) -> None:
     """Refuse options and images that would fail, or be overwritten, after a part of the work is done."""
     from vehicle_detection._common import check_choice, check_integer, check_suffix
 
@@ -109,25 +147,23 @@ def _check(options: DetectOptions, images: list[Path]) -> None:
     check_choice(options.labels, "labels", ("score", "none"))
     if options.line_width is not None:
         check_integer(options.line_width, "line_width", low=1, high=1000)
-    by_name: dict[str, Path] = {}
+    by_name: dict[str, _Image] = {}
     for image in images:
-        if image.is_dir():
-            raise InvalidInputError(
-                f"IMAGE {image} is a folder; choose files in it, such as {image / '*.jpg'}"
-            )
-        if not image.exists():
-            raise InvalidInputError(f"IMAGE {image} does not exist; check the path")
-        if boxes is not None and boxes.exists() and boxes.samefile(image):
-            raise InvalidInputError(f"--boxes {boxes} is one of the images; choose another name")
-        if output is not None and output.exists() and output.samefile(image.parent):
-            raise InvalidInputError(
-                f"--output {output} is the folder of {image.name}, which would be overwritten; choose another"
-            )
         other = by_name.setdefault(image.name, image)
         if other != image and (output is not None or boxes is not None):
             raise InvalidInputError(
                 f"IMAGE {other} and {image} have the same file name, which identifies the results; "
                 "process one folder at a time"
+            )
+        if isinstance(image.source, str):  # a URL
+            continue
+        if not image.source.exists():
+            raise InvalidInputError(f"IMAGE {image} does not exist; check the path")
+        if boxes is not None and boxes.exists() and boxes.samefile(image.source):
+            raise InvalidInputError(f"--boxes {boxes} is one of the images; choose another name")
+        if output is not None and output.exists() and output.samefile(image.source.parent):
+            raise InvalidInputError(
+                f"--output {output} is the folder of {image.name}, which would be overwritten; choose another"
             )
     if boxes is not None:
         check_suffix(boxes, "--boxes", (".csv", ".jsonl", ".ndjson", ".parquet", ".json"))
@@ -139,7 +175,7 @@ def _check(options: DetectOptions, images: list[Path]) -> None:
 
 
 def _detect_each(
-    images: list[Path], detector: vd.Detector, options: DetectOptions, left_out: list[Path]
+    images: list[_Image], detector: vd.Detector, options: DetectOptions, left_out: list[_Image]
 ) -> Iterator[tuple[str, vd.Detections]]:
     """Detect the vehicles of each image, print them, and write what the options name.
 
@@ -149,57 +185,79 @@ def _detect_each(
     import cv2
 
     from vehicle_detection._common import pluralize
-    from vehicle_detection.drawing import score_texts
+    from vehicle_detection.drawing import draw_texts, line_width_for
 
     searched, too_small = False, list[str]()
-    for path, image in _read_each(images, left_out):
+    for image, pixels in _read_each(images, left_out):
         try:
-            found = detector.detect(image)
+            found = detector.detect(pixels)
         except InvalidInputError as error:
-            left_out.append(path)
-            too_small.append(f"{path}: {error}")
+            left_out.append(image)
+            too_small.append(f"{image}: {error}")
             continue
         searched = True
+        texts = _texts(found, detector.camera)
         listed = "".join(
             f"  [{' '.join(f'{side:.0f}' for side in box)}] {text}"
-            for box, text in zip(found.boxes.tolist(), score_texts(found))
+            for box, text in zip(found.boxes.tolist(), texts)
         )
-        print_line(f"{path}: {pluralize(len(found), 'vehicle')}{listed}")
-        shown = image if options.blur is None else vd.blur_boxes(image, found.boxes, region=options.blur)
+        print_line(f"{image}: {pluralize(len(found), 'vehicle')}{listed}")
+        shown = pixels if options.blur is None else vd.blur_boxes(pixels, found.boxes, region=options.blur)
+        name = Path(image.name)
         if options.why is not None:
-            _write_explanations(options.why, path.name, detector, image, shown, found)
+            _write_explanations(options.why, image.name, detector, pixels, shown, found)
         if options.output is not None:
             # As PNG if its own format cannot be written.
-            suffix = path.suffix if cv2.haveImageWriter(f"image{path.suffix}") else f"{path.suffix}.png"
-            scores = options.labels == "score"
-            drawn = vd.draw_detections(shown, found, line_width=options.line_width, scores=scores)
-            vd.write_image(options.output / (path.stem + suffix), drawn)
-        yield path.name, found
+            suffix = name.suffix if cv2.haveImageWriter(f"image{name.suffix}") else f"{name.suffix}.png"
+            drawn = vd.draw_detections(shown, found, line_width=options.line_width, scores=False)
+            if options.labels == "score":
+                width = options.line_width or line_width_for(drawn.shape)
+                draw_texts(drawn, found.boxes, texts, (230, 159, 0), width)
+            target = options.output / name.with_name(name.stem + suffix)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            vd.write_image(target, drawn)
+        yield image.name, found
     if too_small and not searched:
         raise InvalidInputError(too_small[0])
     for reason in too_small:
         print_error(f"warning: {reason}; left out")
 
 
-def _read_each(images: list[Path], left_out: list[Path]) -> Iterator[tuple[Path, Any]]:
+def _texts(found: Any, camera: vd.Camera) -> list[str]:
+    """Return the confidence of each box and, if the lens is known, its distance."""
+    from vehicle_detection._common import UNITS
+    from vehicle_detection.drawing import score_texts
+
+    texts = score_texts(found)
+    if not camera.lens_is_known or not len(found):
+        return texts
+    distances = found.distances(camera).T.tolist()
+    metric = UNITS["metric"]
+    return [
+        text if distance != distance else f"{text} {metric.distance_text(distance, std, with_std=True)}"
+        for text, (distance, std) in zip(texts, distances)
+    ]
+
+
+def _read_each(images: list[_Image], left_out: list[_Image]) -> Iterator[tuple[_Image, Any]]:
     """Yield the images that can be decoded, warn of others and list them; it is an error if all are such."""
     from vehicle_detection.video import is_video_file
 
-    for path in images:
+    for image in images:
         try:
-            if is_video_file(path.name):
-                raise InvalidInputError(f"image file {path} is a video; use vehicle-detection video {path}")
+            if is_video_file(str(image.source)):
+                raise InvalidInputError(f"image file {image} is a video; use vehicle-detection video {image}")
             with capture_stderr() as messages:
-                image = vd.read_image(path)
+                pixels = vd.read_image(image.source)
         except InvalidInputError as error:
-            left_out.append(path)
+            left_out.append(image)
             if len(left_out) == len(images):
                 raise
             print_error(f"warning: {error}; left out")
             continue
         for message in messages:
-            print_error(f"warning: {path}: {message}")
-        yield path, image
+            print_error(f"warning: {image}: {message}")
+        yield image, pixels
 
 
 def _write_explanations(
@@ -211,13 +269,16 @@ def _write_explanations(
     for number, box in enumerate(found.boxes, start=1):
         explanation = vd.explain(detector, image, box)
         print_line(f"  {number}: {explanation}")
-        with atomic_write(folder / f"{name}_{number}.png", "--why") as part:
+        with atomic_write(folder / f"{name.replace('/', '_')}_{number}.png", "--why") as part:
             picture: Any = vd.notebook.plot_explanation(shown, explanation)
             picture.savefig(part)
 
 
 def _warn_if_empty(
-    found: Iterator[tuple[str, vd.Detections]], images: Iterator[Path], detector: vd.Detector, horizon: float
+    found: Iterator[tuple[str, vd.Detections]],
+    images: Iterator[_Image],
+    detector: vd.Detector,
+    horizon: float,
 ) -> Iterator[tuple[str, vd.Detections]]:
     """Pass on what is found; if that is nothing, search some images without the given horizon."""
     import numpy as np
@@ -230,7 +291,7 @@ def _warn_if_empty(
         return
     boxes, shape = [np.empty((0, 4))], tuple[int, ...]()
     with search_everywhere(detector.model, None) as everywhere:
-        for image in map(vd.read_image, itertools.islice(images, _CHECKED_IMAGES)):
+        for image in (vd.read_image(each.source) for each in itertools.islice(images, _CHECKED_IMAGES)):
             shape = shape or image.shape[:2]
             if image.shape[:2] == shape:
                 boxes.append(everywhere.detect(image).boxes)

@@ -24,9 +24,11 @@ def info(
     ),
 ) -> None:
     """Show a model's parameters, accuracy, training data and versions."""
+    from vehicle_detection._common import model_terms
+
     loaded = vd.load_model(model)
     title, facts = loaded.summary()
-    print_facts(f"{model}: {title}", facts)
+    print_facts(f"{model}: {title}", {"license": model_terms(loaded.metadata), **facts})
     for name, values in loaded.metadata.items():
         printed = False
         with contextlib.suppress(

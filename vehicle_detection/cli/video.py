@@ -41,6 +41,7 @@ def video(options: VideoOptions) -> None:
 
     Exit code 3: the source is damaged, and the copy lacks what cannot be decoded.
     """
+    options = options.with_target()
     _check(options)
     outputs = SideOutputs(options)
     files = options.files().values()

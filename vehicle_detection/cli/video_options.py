@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,7 +40,11 @@ class VideoOptions:
         "URL; camera, such as 0; or -.",
     )
     output: Path | None = output_option(
-        None, "TARGET", "Video to write: .mp4, .m4v, .mov or .mkv.", "-o", "--output"
+        None,
+        "TARGET",
+        "Video to write: .mp4, .m4v, .mov or .mkv; default: beside the source, such as drive_tracked.mp4.",
+        "-o",
+        "--output",
     )
     show: bool = output_flag("--show", "Show the annotated frames in a window; Escape ends the run.")
     tracks: Path | None = output_option(
@@ -129,6 +134,24 @@ class VideoOptions:
     def files(self) -> dict[str, Path | None]:
         """Files to write, by their options."""
         return {f"--{name}": getattr(self, name) for name in ("output", "tracks", "report", "events", "srt")}
+
+    def with_target(self) -> VideoOptions:
+        """Name the video to write if one is needed and none or a folder is named; it replaces no file."""
+        from vehicle_detection._common import is_url
+
+        source, folder = Path(self.source), self.output
+        if self.source.isdecimal() or "*" in self.source or self.source == "-" or is_url(self.source):
+            return self
+        if folder is None:
+            alone = not self.show and all(path is None for path in self.files().values())
+            if not alone and self.report is None and self.clips is None:
+                return self
+            folder = source.parent
+        elif not folder.is_dir():
+            return self
+        numbers = itertools.chain([""], (f"_{number}" for number in itertools.count(2)))
+        targets = (folder / f"{source.stem}_tracked{number}.mp4" for number in numbers)
+        return replace(self, output=next(target for target in targets if not target.exists()))
 
     def span(self) -> dict[str, Any]:
         """First and last second of the source."""

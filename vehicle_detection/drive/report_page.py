@@ -18,7 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 import vehicle_detection
-from vehicle_detection._common import ROUGH_DISTANCE, UNITS, Floats, Units, format_with_error, pluralize
+from vehicle_detection._common import (
+    ROUGH_DISTANCE,
+    UNITS,
+    Floats,
+    Units,
+    format_with_error,
+    model_terms,
+    pluralize,
+)
 from vehicle_detection.annotator import MAX_SPEED_STD
 from vehicle_detection.camera import Camera
 from vehicle_detection.drive.counts import VehicleCounts, count_vehicles
@@ -365,17 +373,8 @@ def _model_summary(model: Any) -> dict[str, Any] | None:
     if not hasattr(model, "open_search"):
         return None
     title, facts = model.summary()
-    metadata: Mapping[str, Any] = model.metadata
-    return {"title": title, "license": _license(metadata), "groups": [Group("Details", facts)]}
-
-
-def _license(metadata: Mapping[str, Any]) -> str:
-    """Terms of a model, which are those of its training data."""
-    data = metadata.get("data")
-    sources = data.get("sources") if isinstance(data, Mapping) else None
-    if isinstance(sources, Mapping) and any(name.startswith(("GTI", "KITTI")) for name in sources):
-        return (
-            "License: the model is trained on patches from the GTI vehicle image database and the KITTI "
-            "benchmark, both CC BY-NC-SA 3.0, and inherits their terms: non-commercial use, with attribution."
-        )
-    return "License: the model inherits the terms of the data it was trained on."
+    return {
+        "title": title,
+        "license": f"License: {model_terms(model.metadata)}.",
+        "groups": [Group("Details", facts)],
+    }

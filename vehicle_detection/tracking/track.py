@@ -232,7 +232,7 @@ class FrameResult:
         ]
         data = pandas.DataFrame(rows, columns=["frame", "track_id", "x1", "y1", "x2", "y2", *TRACK_VALUES])
         numbers = dict.fromkeys((*data.columns[2:6], *TRACK_VALUES[:-1]), float)
-        return data.astype(numbers | {"frame": int, "track_id": int}).assign(time_s=self.time)
+        return data.astype(numbers | {"frame": int, "track_id": int, "label": str}).assign(time_s=self.time)
 
     def to_supervision(self) -> Any:
         """Convert the shown tracks to ``supervision.Detections`` with their ids as ``tracker_id``.

@@ -32,6 +32,7 @@ from vehicle_detection._common import (
     pluralize,
     progress_bar,
     single_threaded_opencv,
+    suggest_keywords,
 )
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.tables import TrackTable
@@ -443,6 +444,7 @@ class TrackRun(Closing):
             self.close()
 
 
+@suggest_keywords
 def track(
     source: Source,
     detector: VideoDetector | str | os.PathLike[str] = "default",
