@@ -167,7 +167,7 @@ def test_tables_name_the_files_of_a_list(detector, expected, folder):
     table = TrackTable.from_detections(detector.detect(folder))
     assert table.frame_keys == ("a2.jpg", "a10.jpg")
     assert len(table) == sum(map(len, expected))
-    assert TrackTable.from_detections(list(expected)).frame_keys == (0, 1)
+    assert TrackTable.from_detections([*expected]).frame_keys == (0, 1)
 
 
 def test_tracks_have_the_class_of_most_detections(tmp_path):

@@ -210,7 +210,9 @@ class Detector(Closing):
         """Make the model find boxes with this confidence, or return region parameters that do."""
         limit = _check_confidence(conf, regions)
         if isinstance(self.model, VehicleClassifier):
-            return (regions or RegionParams()).with_peak(self.model.calibration.score(limit))
+            return cast(RegionParams, regions or RegionParams()).with_peak(
+                self.model.calibration.score(limit)
+            )
         model: Any = self.model
         self.model = model.with_confidence(limit)
         return regions

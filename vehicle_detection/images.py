@@ -100,7 +100,7 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
 def _decode_heif(data: bytes, name: str) -> NDArray[np.uint8]:
     """Decode a picture of a phone with the package pillow-heif, if it is installed."""
     try:
-        from pillow_heif import open_heif
+        open_heif = importlib.import_module("pillow_heif").open_heif
     except ImportError:
         raise InvalidInputError(
             f"{name} is HEIC, which needs the package pillow-heif; run pip install pillow-heif, or convert "
@@ -177,9 +177,9 @@ def list_images(source: Any) -> Sequence[Any] | None:
         return None
     path = check_path(source)
     if path.is_dir():
-        files = (Path(folder, name) for folder, _, names in os.walk(path) for name in names)
+        files = [Path(folder, name) for folder, _, names in os.walk(path) for name in names]
     elif not path.exists() and glob.has_magic(str(path)):
-        files = map(Path, glob.iglob(str(path), recursive=True))
+        files = [Path(file) for file in glob.iglob(str(path), recursive=True)]
     else:
         return None
     found = [each for each in files if each.suffix.lower() in IMAGE_SUFFIXES and not is_hidden(each.name)]

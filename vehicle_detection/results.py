@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,8 +76,6 @@ class ImageDetections(Detections):
 
         picture = Image.fromarray(self.plot(**options))
         if in_notebook():
-            from IPython.display import display
-
-            display(picture)
+            importlib.import_module("IPython.display").display(picture)
         elif not ImageShow.show(picture, "vehicles"):
             raise InvalidInputError("show needs a viewer of pictures, and found none; use save(path)")

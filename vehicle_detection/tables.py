@@ -176,13 +176,13 @@ class TrackTable:
 
         The keys of a list are the names of the images' files, or numbers where there are none.
         """
-        if isinstance(detections, (list, tuple)):
+        if isinstance(detections, list):
             paths = [getattr(found, "path", None) for found in detections]
-            names: list[Any] = (
-                [*range(len(paths))] if None in paths else [path.name for path in paths if path]
-            )
-            detections = dict(zip(names if len({*names}) == len(paths) else map(str, paths), detections))
-        check_type(detections, "detections", Mapping, "pass a list, or a dictionary by frame")
+            keys: Any = range(len(paths)) if None in paths else [path.name for path in paths if path]
+            keys = keys if len({*keys}) == len(paths) else map(str, paths)
+            return cls.from_detections(dict(zip(keys, detections)))
+        if not isinstance(detections, Mapping):
+            raise InvalidInputError(f"detections must be a list or a dictionary, got {describe(detections)}")
         for key, found in detections.items():
             check_type(found, f"detections[{key!r}]", Detections, "pass Detections(boxes, scores)")
         parts = [Detections.empty(), *detections.values()]

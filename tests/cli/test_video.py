@@ -71,7 +71,7 @@ def test_video_writes_an_annotated_copy_and_tracks(clip, tmp_path):
     assert [line.split()[0] for line in lines[1:8]] == stages
     assert lines[-1] == f"wrote {target}, {tracks}"
     assert tracks.read_text().splitlines()[0] == (
-        f"{HEADER},distance_m,speed_mps,confidence,distance_std_m,speed_std_mps,time_s"
+        f"{HEADER},distance_m,speed_mps,confidence,distance_std_m,speed_std_mps,label,time_s"
     )
     written, source = probe_video(target), probe_video(clip)
     assert (written.shape, written.fps, written.frames) == (source.shape, source.fps, source.frames)
@@ -219,7 +219,6 @@ BAD_VIDEOS = {
     "{clip} -o {clip}": "--output .+clip.mp4 is also SOURCE",
     "{clip} -o none/out.mp4": "--output needs an existing folder",
     "{clip} -o out.gif": "--output must end in .mp4 or .* got 'out.gif'",
-    "{clip} -o .": "--output must be a file, got the folder",
     "{clip} -o out.mp4 --start 3 --end 2": "--end must be later than the start; got 3 s to 2 s",
     "{clip} -o out.mp4 --start 1:00:06.5": "--start must be less .* 0.4 s; got 3606.5 s",
     "{clip} -o out.mp4 --end 1:2:": r"--end must be a time in seconds or as \[H:\]M:S, .*; got '1:2:'",

@@ -9,7 +9,8 @@ import re
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
-Params, Result = ParamSpec("Params"), TypeVar("Result")
+Params = ParamSpec("Params")
+Result = TypeVar("Result")
 
 _SYNONYMS = {
     "conf": "confidence threshold conf_thres conf_threshold min_conf score_threshold thresh",

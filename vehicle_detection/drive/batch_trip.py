@@ -57,7 +57,7 @@ RECORDED = ("key", "sources", "camera", "date", "start", "settings")
 
 _COLUMNS = {
     "trip": "string", "frame": "int64", "time_s": "double", "track_id": "int64",
-    **dict.fromkeys(DIGITS, "double"),
+    **dict.fromkeys(DIGITS, "double"), "label": "string",
 }  # fmt: skip
 
 
