@@ -182,7 +182,8 @@ def list_images(source: Any) -> Sequence[Any] | None:
         files = [Path(file) for file in glob.iglob(str(path), recursive=True)]
     else:
         return None
-    found = [each for each in files if each.suffix.lower() in IMAGE_SUFFIXES and not is_hidden(each.name)]
+    named = (each for each in files if each.suffix.lower() in IMAGE_SUFFIXES and not is_hidden(each.name))
+    found = [each for each in named if each.is_file()]
     if not found:
         raise InvalidInputError(f"image {path} holds no image file, such as .jpg or .png; check the path")
     return sorted(found, key=lambda each: natural_key(str(each)))
