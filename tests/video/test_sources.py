@@ -686,7 +686,7 @@ def test_times_may_be_numbers_of_numpy(tmp_path):
 
 def test_side_outputs_of_a_live_source_that_drops_frames(tmp_path):
     """On most machines, the search of every frame by one worker is slower than the source."""
-    noise = ["-f", "lavfi", "-i", "testsrc2=size=1920x1080:rate=60:duration=4", "-c:v", "libx264"]
+    noise = ["-f", "lavfi", "-i", "testsrc2=size=1920x1080:rate=60:duration=2", "-c:v", "libx264"]
     encoder = [FFMPEG_BINARY, "-v", "quiet", "-re", *noise, "-preset", "ultrafast", "-f", "mpegts", "pipe:1"]
     names = {"output": "a.mp4", "tracks": "a.csv", "srt": "a.srt", "report": "a.html", "events": "e.csv"}
     command = [sys.executable, "-m", "vehicle_detection", "video", "-", "--live", "--every=1", "--jobs=1"]

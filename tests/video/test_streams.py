@@ -105,14 +105,14 @@ def numbers_from(path, first, count=1, fps=25):
 CODECS = {"vob": ("mpeg2video", "-q:v", 2), "avi": ("mjpeg", "-q:v", 2), "wmv": ("wmv2", "-q:v", 2)}
 
 
-@pytest.mark.parametrize("fps", [24, 25, 30])
+@pytest.mark.parametrize("fps", [24, 25])
 @pytest.mark.parametrize("suffix", ["ts", "m2ts", "vob", "flv", "avi", "wmv", "mkv", "mp4"])
 def test_any_frame_of_any_container_can_be_the_first_one(tmp_path, suffix, fps):
     codec = CODECS.get(suffix, ("libx264",))
     path = write_clip(
         tmp_path / f"clip.{suffix}", gray_frames(24), fps=fps, options=("-g", 16, "-c:v", *codec)
     )
-    for first in range(1, 20, 2):
+    for first in range(1, 20, 3):
         assert numbers_from(path, first, fps=fps) == [first]
 
 
@@ -130,7 +130,7 @@ def test_any_frame_of_any_container_can_be_the_first_one(tmp_path, suffix, fps):
 def test_any_frame_of_streams_without_exact_key_frames_can_be_the_first_one(tmp_path, options):
     name, *options = options
     path = write_clip(tmp_path / name, gray_frames(24), options=options)
-    for first in range(1, 20):
+    for first in range(1, 20, 2):
         assert numbers_from(path, first) == [first]
 
 
@@ -181,9 +181,8 @@ def test_no_frame_is_lost_beside_a_gap_in_the_times(tmp_path):
     assert frame_numbers(tmp_path / "gap.mkv") == [*range(9), *[9] * 16, *range(10, 20)]
 
 
-@pytest.mark.parametrize("target", ["out.mp4", "out.mkv"])
 @pytest.mark.parametrize("delay", [-0.3, 0.0, 0.3])
-@pytest.mark.parametrize("suffix", ["mp4", "mkv", "ts"])
+@pytest.mark.parametrize(("suffix", "target"), [("mp4", "out.mp4"), ("mkv", "out.mkv"), ("ts", "out.mp4")])
 def test_sound_stays_with_its_frames(tmp_path, suffix, delay, target):
     source = write_beep(tmp_path / f"clip.{suffix}", delay=delay)
     process_video(source, tmp_path / target, StubDetector())
