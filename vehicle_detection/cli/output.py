@@ -151,33 +151,18 @@ def print_table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]])
 
     terminal = _terminal_width(sys.stdout)
     rows = [[printable(cell) for cell in row] for row in rows]
-    columns = [list(column) for column in zip(heads, *rows)]
-    padding, widths = _fit_columns(columns, terminal) if terminal else (1, [None] * len(columns))
     table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
-    table.padding = (0, padding)
-    for (head, *cells), column_width in zip(columns, widths):
+    columns = list(zip(heads, *rows))
+    # Lines break at spaces only, if the longest words fit beside each other.
+    words = [max((_cells(word) for cell in column for word in cell.split()), default=0) for column in columns]
+    fit = terminal is None or sum(words) + 3 * len(words) < terminal
+    for (head, *cells), longest in zip(columns, words):
         numeric = all(cell.replace(",", "").rstrip("%").replace(".", "").isdigit() for cell in cells)
         justify: Literal["left", "right"] = "right" if numeric and rows else "left"
-        table.add_column(head, justify=justify, overflow="fold", width=column_width)
+        table.add_column(head, justify=justify, overflow="fold", min_width=longest if fit else None)
     for row in rows:
         table.add_row(*row)
     Console(width=terminal or _PIPE_WIDTH, highlight=False, markup=False).print(table)
-
-
-def _fit_columns(columns: Sequence[Sequence[str]], width: int) -> tuple[int, list[int | None]]:
-    """Choose padding and widths that break a table's lines at spaces only; None if the words do not fit."""
-    full = [max(map(_cells, column)) for column in columns]
-    words = [max((_cells(word) for cell in column for word in cell.split()), default=0) for column in columns]
-    for padding in (1, 0):
-        spare = width - 1 - (2 * padding + 1) * len(columns) - sum(words)
-        if spare >= 0:
-            widths: list[int | None] = []
-            for most, least in zip(full, words):
-                extra = min(most - least, spare)
-                widths.append(least + extra)
-                spare -= extra
-            return padding, widths
-    return 0, [None] * len(columns)
 
 
 def print_facts(title: str, facts: Mapping[str, Any]) -> None:
