@@ -6,7 +6,7 @@ import base64
 import dataclasses
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from itertools import pairwise
@@ -29,7 +29,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.annotator import MAX_SPEED_STD
 from vehicle_detection.camera import Camera
-from vehicle_detection.drive.counts import VehicleCounts, count_vehicles
+from vehicle_detection.drive.counts import count_vehicles
 from vehicle_detection.drive.events import KINDS, Event
 from vehicle_detection.drive.history import TrackHistory, bin_means, track_histories
 from vehicle_detection.drive.report_charts import (
@@ -95,23 +95,6 @@ class Figure(NamedTuple):
     svg: str = ""
 
 
-class Table(NamedTuple):
-    """A table of text cells; the first cell of a row is its header, which may go to a frame."""
-
-    label: str
-    note: str
-    header: Sequence[str]
-    rows: list[list[str]]
-    frames: Sequence[int] = ()  # of the first rows
-
-
-class Group(NamedTuple):
-    """Named values that the reader can unfold."""
-
-    title: str
-    values: Mapping[str, Any]
-
-
 def render_page(
     table: TrackTable,
     report: VideoReport,
@@ -158,7 +141,7 @@ def render_page(
         events=events,
         event_kinds=KINDS,
         pictures=pictures,
-        minutes=_minute_table(count_vehicles(events, table, fps=axis.fps), axis.fps) if tracks else None,
+        drive=count_vehicles(events, table, fps=axis.fps),
         fraction_bar=fraction_bar,
         settings=_settings(detector, report.shape),
         model=_model_summary(getattr(detector, "model", None)),
@@ -219,25 +202,6 @@ def _counts(
         distance = format_with_error(found.distance_m, found.std_m)
         counts["Nearest"] = f"{distance} {units.distance_symbol}, #{track_id}"
     return counts
-
-
-def _minute_table(counts: VehicleCounts, fps: float) -> Table:
-    """List the counts of each minute, and of the whole video."""
-    rows = []
-    for minute in counts.minutes + ((counts.total,) if len(counts.minutes) > 1 else ()):
-        whole = minute is counts.total
-        name = "Total" if whole else format_time(minute.start_s, tenths=False)
-        numbers = minute.met, minute.we_overtook, minute.overtook_us, minute.passed
-        rows.append([name, *map(str, numbers), f"{minute.mean_in_view:.1f}", str(minute.max_in_view)])
-    note = (
-        "Number of vehicles in each minute. Passed by us: vehicles that stood, or whose direction is "
-        "uncertain. The last two columns count the vehicles that are visible at the same time."
-    )
-    header = (
-        "From", "Oncoming", "Overtaken by us", "Overtook us", "Passed by us", "Mean in view", "Most in view"
-    )  # fmt: skip
-    frames = [round(minute.start_s * fps) for minute in counts.minutes]
-    return Table("Counts by minute", note, header, rows, frames)
 
 
 def _figures(
@@ -344,8 +308,8 @@ def _script_data(tracks: Sequence[TrackHistory], axis: TimeAxis, own: Floats | N
     }  # fmt: skip
 
 
-def _settings(detector: Any, shape: tuple[int, ...]) -> list[Group]:
-    """Parameters of a detector, a group for each dataclass of them."""
+def _settings(detector: Any, shape: tuple[int, ...]) -> dict[str, dict[str, Any]]:
+    """Parameters of a detector, by the title of each dataclass of them."""
     part = getattr(detector, "detector", None)
     search, regions = (getattr(part, name, None) for name in ("search_params", "region_params"))
     bands = getattr(search, "bands", ())
@@ -359,12 +323,11 @@ def _settings(detector: Any, shape: tuple[int, ...]) -> list[Group]:
     if isinstance(camera, Camera):
         title = "Camera" if camera.lens_is_known else "Camera (assumed)"
         groups[title] = camera.for_shape(shape)
-    found = []
+    found = {}
     for title, params in groups.items():
         if dataclasses.is_dataclass(params):
             names = (each.name for each in dataclasses.fields(params))
-            values = {name: getattr(params, name) for name in names if name not in ("bands", "shape")}
-            found.append(Group(title, values))
+            found[title] = {name: getattr(params, name) for name in names if name not in ("bands", "shape")}
     return found
 
 
@@ -373,8 +336,4 @@ def _model_summary(model: Any) -> dict[str, Any] | None:
     if not hasattr(model, "open_search"):
         return None
     title, facts = model.summary()
-    return {
-        "title": title,
-        "license": f"License: {model_terms(model.metadata)}.",
-        "groups": [Group("Details", facts)],
-    }
+    return {"title": title, "license": f"License: {model_terms(model.metadata)}.", "details": facts}
