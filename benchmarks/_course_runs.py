@@ -99,8 +99,8 @@ class Runs:
 
     def __init__(self, patch_set: PatchSet, folder: Path) -> None:
         self.patch_set = patch_set
-        self._svm_rows = folder / "rows.csv"
-        self._extra = RowStore(folder / "extra_rows.csv", _EXTRA_COLUMNS)
+        self._svm_rows = folder / "rows.jsonl"
+        self._extra = RowStore(folder / "extra_rows.jsonl", _EXTRA_COLUMNS)
         # Keep one set of features at a time, to limit the memory.
         self.cache = FeatureCache(patch_set.patches, memory_mb=0)
         seeds = {"random": SEEDS, "groups": SEEDS}

@@ -133,16 +133,16 @@ class _TimedModule:
 
 
 _KERNELS = {
-    "normalize_blocks": "blocks",
+    "hog_cells": "HOG cells",
+    "hog_blocks": "blocks",
     "histogram_cells": "histogram",
     "add_root_histograms": "histogram",
-    "spatial_cells": "spatial bins",
+    "add_correlation": "correlation",
 }
 _MODULES = {"cv2": {"resize": "spatial bins"}}
 _FUNCTIONS = {
     "resize_band": "resize",
     "convert_color": "color",
-    "fill_hog_cells": "HOG cells",
     "_hits": "hits",
 }
 
@@ -160,8 +160,6 @@ def _timed_stages(stopwatch: _Stopwatch) -> Iterator[None]:
             put(name, _TimedModule(getattr(search, name), stopwatch, functions, everything=False))
         for name, stage in _FUNCTIONS.items():
             put(name, stopwatch.wrap(stage, getattr(search, name)))
-        timed = stopwatch.wrap("correlation", _kernels.Filter.add_to)
-        stack.enter_context(mock.patch.object(_kernels.Filter, "add_to", timed))
         yield
 
 

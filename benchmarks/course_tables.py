@@ -2,7 +2,7 @@
 
 Writes a CSV and a figure for each table to ``OUT/results``, and the page ``OUT/results.md``. This takes an
 hour or two on two cores. Finished runs are stored in ``OUT/results`` row by row, so that a killed run
-continues; delete ``rows.csv`` and ``extra_rows.csv`` to measure everything again.
+continues; delete ``rows.jsonl`` and ``extra_rows.jsonl`` to measure everything again.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Written by
     python -m benchmarks.course_tables --data FOLDER
 
 where FOLDER holds the course's `vehicles.zip` and `non-vehicles.zip` (8,792 and 8,968 patches). `results/`
-holds a CSV and a figure of each table, and every run in `rows.csv`.
+holds a CSV and a figure of each table, and every run in `rows.jsonl`.
 
 All models are linear SVMs behind a `StandardScaler`, both fitted on the training part only, on the original
 patches (not mirrored). `random` is the course's split, 80 to 20, and `groups` tests on whole groups of near

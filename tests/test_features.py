@@ -161,7 +161,7 @@ def test_the_kernel_bins_all_uint8_gradients_like_the_reference(orient):
     for start in range(0, 511, 73):
         tiles = np.ascontiguousarray(image[start : start + 73].reshape(73 * 3, 511 * 3))
         cells = np.empty((1, orient, *tiles.shape), np.float32)
-        kernels.hog_cells(tiles, 1, 1, cotangents, cells)
+        kernels.sum_magnitudes(tiles, 1, 1, cotangents, cells)
         middles = cells[0, :, 1::3, 1::3]
         rows = slice(start, start + 73)
         np.testing.assert_allclose(middles.sum(axis=0), length[rows], rtol=1e-6)
@@ -261,9 +261,6 @@ def test_convert_color(color_space):
     assert converted.dtype == np.uint8
     assert not np.shares_memory(converted, patch)
     np.testing.assert_array_equal(convert_color(patch, f"RGB2{color_space}"), converted)
-    out = np.empty_like(patch)
-    assert np.shares_memory(convert_color(patch, color_space, out=out), out)
-    np.testing.assert_array_equal(out, converted)
     np.testing.assert_array_equal(patch, before)
     # Converting a view gives the view of the converted image.
     np.testing.assert_array_equal(convert_color(patch[8:40, ::-2], color_space), converted[8:40, ::-2])

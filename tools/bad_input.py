@@ -35,7 +35,7 @@ import numpy as np
 import vehicle_detection as vd
 from vehicle_detection.boxes import Platt
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
-from vehicle_detection.training import Halving, to_pipeline
+from vehicle_detection.training import to_pipeline
 from vehicle_detection.video import VideoReport
 
 from .site_pages import SUBPACKAGE_NAMES
@@ -374,7 +374,6 @@ class _Valid:
                 "tracks_only": True,
                 "dry_run": True,
             },
-            "search_parameters": {"grid": {"orient": [4]}, "halving": Halving(n_folds=2), "options": quick},
             "search_windows": {"windows": boxes, "jobs": 1},
             "single_img_features": {"image": patches[0]},
             "split_random": {"patches_or_labels": labels},
@@ -414,7 +413,7 @@ _OTHER_NAMES = {
     "name": "preset", "detector": "model", "imgs": "image file", "hist_feat": "features",
     "hog_feat": "features", "spatial_feat": "features",
     "vehicles": "png|csv", "non_vehicles": "png|json", "source": "png|csv", "images": "folder",
-    "bbox_list": "boxes", "patches_or_labels": "vehicles", "halving": "n_folds",
+    "bbox_list": "boxes", "patches_or_labels": "vehicles",
 }  # fmt: skip
 """What the error of a bad argument may name instead."""
 
@@ -431,9 +430,6 @@ _ALSO_OTHER_ERRORS = (
 )  # fmt: skip
 """Calls whose error may be that of another argument, which the bad one contradicts."""
 
-_KEEPS_FILES = "tune --cache "
-"""Start of the texts of calls whose files stay after an error: what is cached saves time the next time."""
-
 
 @dataclass
 class Outcome:
@@ -449,7 +445,7 @@ class Outcome:
             self.accepted += 1
         elif isinstance(error, VehicleDetectionError):
             self.refused += 1
-            if written and not text.startswith(_KEEPS_FILES):
+            if written:
                 self.problems.append(f"{text}: failed, but left {sorted(written)}")
             argument = re.match(r"[\w.]+\((\w+)=", text)
             if argument and not _names(argument[1], text, error):

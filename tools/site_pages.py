@@ -66,7 +66,7 @@ SUBPACKAGE_NAMES = {
     "tracking": "HorizonEstimate SceneCuts",
     "training": (
         "compare_configurations compare_searches FrameDataset mine_negatives pareto_front "
-        "PatchFeatures read_results search_parameters TrainingReport TrialOptions"
+        "PatchFeatures read_results TrainingReport TrialOptions"
     ),
     "video": "FrameSource TrackRun VideoReport",
 }

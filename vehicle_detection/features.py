@@ -224,17 +224,15 @@ class FeatureParams(Checked):
         return gains
 
 
-def convert_color(
-    image: NDArray[np.uint8], color_space: str = "YCrCb", *, out: NDArray[np.uint8] | None = None
-) -> NDArray[np.uint8]:
+def convert_color(image: NDArray[np.uint8], color_space: str = "YCrCb") -> NDArray[np.uint8]:
     """Convert an RGB image to another color space, with OpenCV's 8-bit ranges.
 
     Returns ``(H, W, 3)`` uint8; a copy, also for ``"RGB"``.
 
     Parameters
     ----------
-    image, out
-        ``(H, W, 3)`` uint8 RGB; output array of this shape, None allocates one.
+    image
+        ``(H, W, 3)`` uint8 RGB.
     color_space
         ``"RGB"``, ``"HSV"`` (hue 0-179), ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or ``"LAB"``; the
         course's spelling ``"RGB2YCrCb"`` is also accepted.
@@ -247,16 +245,9 @@ def convert_color(
     check_image(image)
     space = str(color_space).removeprefix("RGB2")
     check_choice(space, "color_space", COLOR_SPACES)
-    if out is not None:
-        check_image(out, "out")
-        if out.shape != image.shape:
-            raise InvalidInputError(f"out must have the shape of image, {image.shape}; got {out.shape}")
-    if space != "RGB":
-        return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_RGB2{space}"), dst=out), np.uint8)
-    if out is None:
+    if space == "RGB":
         return image.copy()
-    out[:] = image
-    return out
+    return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_RGB2{space}")), np.uint8)
 
 
 def hog_source(
@@ -291,14 +282,16 @@ def hog_blocks(
 
 
 def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None = None) -> NDArray[np.float64]:
-    """Feature vector of one 64x64 patch, computed by the reference functions.
+    """Feature vector of one patch by scikit-image, OpenCV and NumPy: the reference of `extract_features`.
 
-    Returns ``(params.length,)`` float64.
+    Returns ``(params.length,)`` float64. HOG is that of Dalal and Triggs, "Histograms of oriented gradients
+    for human detection" (CVPR 2005), with L2-Hys normalization. `vehicle_detection.course` has the functions
+    of the single parts.
 
     Parameters
     ----------
     image, params
-        ``(64, 64, 3)`` uint8 RGB, and the features to compute, by default ``FeatureParams()``.
+        ``(64, 64, 3)`` uint8 RGB; the default is ``FeatureParams()``.
 
     Examples
     --------
@@ -391,16 +384,32 @@ def _extract_batch(patches: NDArray[np.uint8], features: NDArray[np.float32], pa
         if params.hist_sqrt:
             np.sqrt(hist, out=hist)
     if params.hog_feat:
-        channels = params.hog_channels
-        sizes = params.pix_per_cell, params.cell_per_block, params.coarse_blocks
         source = hog_source(tall, params, converted.get(params.color_space))
-        source = source.reshape(len(patches), PATCH_SIZE, PATCH_SIZE, channels)
-        if params.transform_sqrt:
-            bounds = kernels.degree_bounds(params.orient)
-            kernels.patch_hog_from_angles(*kernels.sqrt_gradients(source), bounds, channels, *sizes, hog)
-        else:
-            flat = source.reshape(len(patches), PATCH_SIZE, PATCH_SIZE * channels)
-            kernels.patch_hog(flat, channels, *sizes, kernels.orientation_cotangents(params.orient), hog)
+        source = source.reshape(len(patches), PATCH_SIZE, PATCH_SIZE, -1)
+        for start in range(0, len(patches), _PATCHES):
+            rows = slice(start, start + _PATCHES)
+            _fill_hog(source[rows], hog[rows], params)
+
+
+# Patches whose HOG is computed together: as many as fit into the cache.
+_PATCHES = 8
+
+
+def _fill_hog(source: NDArray[np.uint8], hog: NDArray[np.float32], params: FeatureParams) -> None:
+    """Fill the HOG of a few patches ``(N, 64, 64, channels)``, as the channels of one image."""
+    image = source.transpose(1, 2, 0, 3).reshape(PATCH_SIZE, PATCH_SIZE, -1)
+    cells = kernels.hog_cells(image, params.orient, params.pix_per_cell, params.transform_sqrt)
+    parts = [kernels.hog_blocks(cells, params.cell_per_block)[..., : params.blocks, : params.blocks]]
+    if params.coarse_blocks:
+        coarse = kernels.hog_blocks(kernels.pool_cells(cells), params.cell_per_block, dilation=2)
+        parts.append(coarse[..., ::2, ::2][..., : params.coarse_blocks, : params.coarse_blocks])
+    start = 0
+    for part in parts:
+        # From (channel, cell row, cell column, orientation, block row, block column) to scikit-image's order.
+        ordered = part.transpose(0, 4, 5, 1, 2, 3)
+        shape, stop = (len(hog), -1, *ordered.shape[1:]), start + part.size // len(hog)
+        hog[:, start:stop].reshape(shape)[:] = ordered.reshape(shape)
+        start = stop
 
 
 def read_patches(source: Any, name: str) -> NDArray[np.uint8]:

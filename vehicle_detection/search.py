@@ -18,6 +18,7 @@ Felzenszwalb et al. (PAMI 2010), section 3, for linear templates as filters over
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import time
 from abc import ABC, abstractmethod
@@ -31,7 +32,6 @@ from numpy.typing import NDArray
 
 from vehicle_detection import _kernels as kernels
 from vehicle_detection._common import (
-    NEW_ARRAYS,
     Checked,
     Closing,
     ThreadTeam,
@@ -360,7 +360,7 @@ class BandSearch(FrameSearch):
 
         Entry ``[i, j]`` is the window that starts at row `i` and column `j` of the resized band's cells.
         """
-        return self.filters.score_map(resize_band(image, band, self.workspace), self.workspace)
+        return self.filters.score_map(resize_band(image, band))
 
 
 def resized_shape(band: PixelBand) -> tuple[int, int]:
@@ -370,9 +370,7 @@ def resized_shape(band: PixelBand) -> tuple[int, int]:
     return max(height, PATCH_SIZE), max(width, PATCH_SIZE)
 
 
-def resize_band(
-    image: NDArray[np.uint8], band: PixelBand, workspace: Workspace = NEW_ARRAYS
-) -> NDArray[np.uint8]:
+def resize_band(image: NDArray[np.uint8], band: PixelBand) -> NDArray[np.uint8]:
     """Crop a band and resize it so that its windows are 64x64; columns beyond the frame are replicated."""
     height, width = resized_shape(band)
     scale = PATCH_SIZE / band.window[0]
@@ -381,14 +379,11 @@ def resize_band(
     strip = image[band.y1 : band.y2, max(0, band.x1) : band.x2]
     size = (width - left - right, height)
     if size != (strip.shape[1], strip.shape[0]):
-        memory = workspace.take((size[1], size[0], 3), np.uint8, "strip")
-        strip = np.asarray(cv2.resize(strip, size, dst=memory), np.uint8)
+        strip = np.asarray(cv2.resize(strip, size), np.uint8)
     if not left and not right:
         return strip
     # Replication adds no gradient at the frame's border.
-    memory = workspace.take((height, width, 3), np.uint8, "band")
-    padded = cv2.copyMakeBorder(strip, 0, 0, left, right, cv2.BORDER_REPLICATE, dst=memory)
-    return np.asarray(padded, np.uint8)
+    return np.asarray(cv2.copyMakeBorder(strip, 0, 0, left, right, cv2.BORDER_REPLICATE), np.uint8)
 
 
 def _hits(
@@ -411,26 +406,8 @@ def _hits(
     return boxes, grid[rows, columns].astype(np.float64)
 
 
-def fill_hog_cells(
-    image: NDArray[Any], orient: int, cell: int, transform_sqrt: bool, cells: NDArray[np.float32]
-) -> None:
-    """Fill ``(channels, orient, rows, columns)`` float32 with the orientation histograms of an image's cells.
-
-    Equals the first stage of scikit-image's HOG; `image` is ``(H, W, channels)``, uint8 or float.
-    Without `transform_sqrt`, a gradient of floats exactly on a bound of bins may fall into the other one.
-    """
-    channels = image.shape[2]
-    if transform_sqrt:
-        if image.dtype != np.uint8 and image.min() < 0:
-            raise InvalidInputError(
-                "transform_sqrt must be False for negative values, which float LUV and LAB images have; "
-                "convert a uint8 image, or switch it off"
-            )
-        gradients = kernels.sqrt_gradients(image)
-        kernels.sum_orientations(*gradients, kernels.degree_bounds(orient), channels, cell, cells)
-    else:
-        flat = np.ascontiguousarray(image).reshape(len(image), -1)
-        kernels.hog_cells(flat, channels, cell, kernels.orientation_cotangents(orient), cells)
+Filter = tuple[NDArray[np.float32], int]
+_to_float32 = functools.partial(np.ascontiguousarray, dtype=np.float32)
 
 
 class BandFilters:
@@ -443,7 +420,6 @@ class BandFilters:
         self.params = params
         _check_shareable(params)
         self.cells_per_window = params.cells  # along a side
-        self.block = params.cell_per_block
         self.bins_per_cell = params.spatial_size // params.cells
         # Look up weights by pixel value, or, as roots of counts are not linear in these, count each window.
         self.hist_roots = params.hist_feat and params.hist_sqrt
@@ -458,8 +434,8 @@ class BandFilters:
         self.weights_by_bin = by_bin = by_bin.reshape(len(functions), 3, -1)
         self.tables = by_bin[:, :, self.bins] if self.hist_lookup else None
 
-    def _build_filters(self, weights: NDArray[np.float64]) -> list[kernels.Filter]:
-        """Build the filters of one template: over HOG, over coarse HOG, over spatial bins and histogram."""
+    def _build_filters(self, weights: NDArray[np.float64]) -> list[Filter]:
+        """Weights ``(rows, columns, channels)`` and dilation over HOG, coarse HOG, and bins and histogram."""
         params, cells, bins = self.params, self.cells_per_window, self.bins_per_cell
         filters = []
         # The vector is spatial bins, histogram, HOG, coarse HOG.
@@ -473,9 +449,7 @@ class BandFilters:
                     # (channel, block row, block column, values in the block) to
                     # (block row, block column, channel and values), the order of `_hog_maps`.
                     blocks = part.reshape(params.hog_channels, positions, positions, -1).transpose(1, 2, 0, 3)
-                    filters.append(
-                        kernels.Filter(blocks.reshape(positions, positions, -1), dilation=dilation)
-                    )
+                    filters.append((_to_float32(blocks.reshape(positions, positions, -1)), dilation))
         values = []
         if params.spatial_feat:
             planes = params.spatial_planes(weights[: params.spatial_length])
@@ -485,18 +459,15 @@ class BandFilters:
             values.append(part.transpose(1, 3, 0, 2, 4).reshape(cells, cells, -1))
         if self.hist_lookup:
             values.append(np.ones((cells, cells, 1)))
-        return [*filters, kernels.Filter(np.concatenate(values, axis=2))] if values else filters
+        return [*filters, (_to_float32(np.concatenate(values, axis=2)), 1)] if values else filters
 
-    def score_map(self, band: NDArray[np.uint8], workspace: Workspace) -> NDArray[np.float32]:
+    def score_map(self, band: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Scores of all windows of a resized band as a new ``(rows, columns)`` float32 array."""
         params = self.params
-        converted = {
-            space: convert_color(band, space, out=workspace.take(band.shape, np.uint8, space))
-            for space in params.used_color_spaces
-        }
+        converted = {space: convert_color(band, space) for space in params.used_color_spaces}
         source = hog_source(band, params, converted.get(params.color_space)) if params.hog_feat else None
         spatial, hist = (converted.get(space, band) for space in (params.spatial_space, params.hist_space))
-        return self.score_images(source, spatial, hist, self.tables, workspace)
+        return self.score_images(source, spatial, hist, self.tables)
 
     def score_images(
         self,
@@ -504,63 +475,48 @@ class BandFilters:
         spatial: NDArray[Any],
         hist: NDArray[Any],
         tables: NDArray[np.float32] | None,
-        workspace: Workspace,
     ) -> NDArray[np.float32]:
         """Scores of all windows from the images of HOG, spatial bins and histogram, ``(H, W, channels)``.
 
         `tables` is ``(templates, 3, values)``, the histogram's weight of each value of the integers `hist`.
         """
-        cell, maps = self.params.pix_per_cell, self._hog_maps(source, workspace)
-        rows, columns = spatial.shape[0] // cell, spatial.shape[1] // cell
+        cell, side = self.params.pix_per_cell, self.cells_per_window
+        maps = [] if source is None else self._hog_maps(source)
         if self.params.spatial_feat or self.hist_lookup:
-            maps.append(self._value_map(spatial, workspace))
-        side = self.cells_per_window
-        shape = (len(self.filters), rows - side + 1, columns - side + 1)
-        scores = np.empty(shape, np.float32)
+            maps.append(self._value_map(spatial))
+        rows, columns = (length // cell - side + 1 for length in spatial.shape[:2])
+        scores = np.empty((len(self.filters), rows, columns), np.float32)
         for template, (filters, bias) in enumerate(zip(self.filters, self.biases)):
             scores[template] = bias
             if tables is not None:
                 # The last channel of the last map is the histogram's; each template fills it again.
                 kernels.histogram_cells(hist, tables[template], cell, maps[-1][-1])
-            for template_filter, channels in zip(filters, maps):
-                template_filter.add_to(channels, scores[template], workspace)
+            for (weights, dilation), channels in zip(filters, maps):
+                kernels.add_correlation(channels, weights, dilation, scores[template])
         if self.hist_roots:
-            weights = self.weights_by_bin
-            kernels.add_root_histograms(hist, self.bins, weights, cell, side, scores)
+            kernels.add_root_histograms(hist, self.bins, self.weights_by_bin, cell, side, scores)
         return scores[0] if len(scores) == 1 else np.asarray(scores.max(axis=0))
 
-    def _hog_maps(self, source: NDArray[Any] | None, workspace: Workspace) -> list[NDArray[np.float32]]:
+    def _hog_maps(self, source: NDArray[Any]) -> list[NDArray[np.float32]]:
         """Compute the blocks of HOG and, if used, of coarse HOG; each ``(channels, rows, columns)``."""
-        if source is None:
-            return []
-        params, cell = self.params, self.params.pix_per_cell
-        rows, columns, channels = source.shape[0] // cell, source.shape[1] // cell, source.shape[2]
-        cells = workspace.take((channels, params.orient, rows, columns), np.float32, "cells")
-        fill_hog_cells(source, params.orient, cell, params.transform_sqrt, cells)
-        shape = (channels, self.block, self.block, params.orient, rows, columns)
-        blocks = workspace.take(shape, np.float32, "blocks")
-        kernels.normalize_blocks(cells, self.block, 1, blocks)
-        maps = [blocks.reshape(-1, rows, columns)]
+        params = self.params
+        cells = kernels.hog_cells(source, params.orient, params.pix_per_cell, params.transform_sqrt)
+        maps = [kernels.hog_blocks(cells, params.cell_per_block)]
         if self.coarse:
-            pooled = workspace.take(cells.shape, np.float32, "pooled")
-            kernels.pool_cells(cells, pooled)
-            blocks = workspace.take(shape, np.float32, "coarse blocks")
-            kernels.normalize_blocks(pooled, self.block, 2, blocks)
-            maps.append(blocks.reshape(-1, rows, columns))
-        return maps
+            maps.append(kernels.hog_blocks(kernels.pool_cells(cells), params.cell_per_block, dilation=2))
+        return [blocks.reshape(-1, *cells.shape[2:]) for blocks in maps]
 
-    def _value_map(self, image: NDArray[Any], workspace: Workspace) -> NDArray[np.float32]:
+    def _value_map(self, image: NDArray[Any]) -> NDArray[np.float32]:
         """Spatial bins of each cell ``(channels, rows, columns)`` and, last, a channel for the histogram."""
-        cell, per_cell = self.params.pix_per_cell, self.bins_per_cell
+        cell, bins = self.params.pix_per_cell, self.bins_per_cell
         rows, columns = image.shape[0] // cell, image.shape[1] // cell
-        count = 3 * per_cell**2 if self.params.spatial_feat else 0
-        channels = workspace.take((count + int(self.hist_lookup), rows, columns), np.float32, "values")
+        count = 3 * bins**2 if self.params.spatial_feat else 0
+        channels = np.empty((count + self.hist_lookup, rows, columns), np.float32)
         if count:
-            size = (columns * per_cell, rows * per_cell)
-            memory = workspace.take((size[1], size[0], 3), image.dtype, "bins")
-            bins = cv2.resize(image[: rows * cell, : columns * cell], size, dst=memory)
-            cells = channels[:count].reshape(3, per_cell, per_cell, rows, columns)
-            kernels.spatial_cells(bins, per_cell, cells)
+            small = cv2.resize(image[: rows * cell, : columns * cell], (columns * bins, rows * bins))
+            # (cell row, bin row, cell column, bin column, color) to (color, bin row, bin column, cells)
+            split = small.reshape(rows, bins, columns, bins, 3).transpose(4, 1, 3, 0, 2)
+            channels[:count] = split.reshape(count, rows, columns)
         return channels
 
 

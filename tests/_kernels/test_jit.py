@@ -85,6 +85,6 @@ def test_a_change_of_another_kernel_file_is_noticed(tmp_path):
 
     assert hits() == 0
     assert hits() == 1
-    with (copy / "_kernels" / "vector.py").open("a") as file:
+    with (copy / "_kernels" / "linear_svm.py").open("a") as file:
         file.write("# changed\n")
     assert hits() == 0

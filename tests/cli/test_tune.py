@@ -54,29 +54,30 @@ def test_a_grid_becomes_a_table_and_a_figure(patches, tmp_path, monkeypatch):
     assert out.read_text() == text
 
 
-@pytest.mark.parametrize("split", ["sequences", "groups", "random"])
-def test_halving_measures_its_finalists(patches, tmp_path, split):
-    out = tmp_path / "table.jsonl"
-    grid = f"orient=3,4 C=1e-4,1e-2 {SMALL}"
-    result = run(*patches, "--grid", grid, "-o", out, "--halving", "--finalists", 2, "--split", split)
+def test_a_search_is_varied_on_labelled_frames(material, tmp_path):
+    out, plot = tmp_path / "searches.csv", tmp_path / "plot.png"
+    grid = "scales=1,0.8+1.5 overlap=0.75 threshold=1,4,500"
+    words = ["--frames", material / "road", "--labels", material / "road.csv", "--plot", plot]
+    result = run("--grid", grid, "-o", out, *words)
     assert result.exit_code == 0, result.output
-    assert "2 measured" in result.stdout
     table = read_results(out)
-    assert list(table[table["stage"] == "final"]["split"]) == [split] * 2
-    assert (table["stage"] == "halving").sum() == 4 * 3
+    assert len(table) == 6
+    assert set(table["scales"].astype(str)) == {"1", "0.8+1.5"}
+    assert table["f1"].is_monotonic_decreasing
+    assert (table["recall"][table["threshold"] == 500] == 0).all()
+    assert re.search(r"6 searches, best first\s+scales +overlap +threshold +f1", result.stdout)
+    assert plot.exists()
 
 
 def test_frames_are_scored(patches, material, tmp_path):
     out = tmp_path / "table.parquet"
     words = ["--frames", material / "road", "--labels", material / "road.csv"]
-    words += ["--cache", tmp_path / "features"]
     result = run(*patches, "--grid", f"orient=3 {SMALL}", "-o", out, *words)
     assert result.exit_code == 0, result.output
     assert re.search(r"frames F1 +best F1", result.stdout)
     assert out.exists()
     (row,) = read_results(tmp_path / "table.jsonl").to_dict("records")
     assert row["frame_f1_by_set"].startswith("road ")
-    assert len(list((tmp_path / "features").glob("*.npy"))) == 1
 
 
 def test_an_interrupt_keeps_the_measured_rows(patches, tmp_path, monkeypatch):
@@ -92,16 +93,20 @@ def test_an_interrupt_keeps_the_measured_rows(patches, tmp_path, monkeypatch):
     monkeypatch.setattr(trials.Trials, "measure", interrupted)
     result = run(*patches, "--grid", f"orient=3,4 {SMALL}", "-o", tmp_path / "table.csv")
     assert result.exit_code == 130
-    assert list(read_results(tmp_path / "table.csv")["orient"]) == [3]
+    assert list(read_results(tmp_path / "table.jsonl")["orient"]) == [3]
 
 
 def test_tune_refuses_bad_input(patches, material, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("a.csv").write_text("a,b\n1,2\n")
+    for name in ("a.csv", "a.jsonl"):
+        Path(name).write_text("a,b\n1,2\n")
     cases = {
         "{patches} -o t.csv --grid color=LAB": "--grid has the unknown option 'color'",
         "{patches} -o t.csv --grid orient": "--grid must look like 'orient=8,9",
-        "{patches} {grid} -o t.csv --halving --finalists 0": "--finalists must be an integer at least 1",
+        "{grid} -o t.csv": "--grid of features needs patches to train on; give --vehicles and",
+        "--grid scales=1 -o t.csv": "--grid of a search needs labelled frames",
+        "--grid scales=a+b -o t.csv {frames}": "--grid must join scales by +",
+        "--grid overlap=1 -o t.csv {frames}": "--grid must be a number, at least 0 and at most 0.99",
         "{patches} {grid} -o t.csv --split half": "--split must be one of 'sequences'",
         "{patches} {grid} -o t.xls": "--output must end in .csv or .jsonl or .parquet",
         "{patches} {grid} -o none/t.csv": "--output needs an existing folder",
@@ -110,14 +115,15 @@ def test_tune_refuses_bad_input(patches, material, tmp_path, monkeypatch):
         "{patches} {grid} -o t.csv --frames {material}/road": "--frames and --labels .*; give both",
         "{patches} {grid} -o t.csv --horizon 0.5": "--horizon needs --frames",
         "--vehicles missing.zip {others} {grid} -o t.csv": "missing.zip does not exist",
-        "{patches} {grid} -o a.csv": "is not a table of trials",
+        "{patches} {grid} -o a.jsonl": "is not a table of trials",
         "--vehicles a.csv {others} {grid} -o a.csv": "is also --vehicles",
     }
     vehicles, others = (f"{name} {path}" for name, path in (patches[:2], patches[2:]))
-    files = {"patches": f"{vehicles} {others}", "others": others, "material": material}
+    frames = f"--frames {material}/road --labels {material}/road.csv"
+    files = {"patches": f"{vehicles} {others}", "others": others, "material": material, "frames": frames}
     commands.refuse_each("tune", cases, grid=f"--grid 'orient=3 {SMALL}'", **files)
-    assert commands.contents(tmp_path) == ["a.csv"]
-    assert Path("a.csv").read_text() == "a,b\n1,2\n"
+    assert commands.contents(tmp_path) == ["a.csv", "a.jsonl"]
+    assert Path("a.csv").read_text() == Path("a.jsonl").read_text() == "a,b\n1,2\n"
 
 
 def test_a_grid_that_cannot_be_trained_is_an_error(patches, tmp_path):
@@ -130,16 +136,6 @@ def test_a_grid_that_cannot_be_trained_is_an_error(patches, tmp_path):
         assert not (tmp_path / "t.csv").exists()
 
 
-def test_a_table_that_windows_has_saved_is_continued(patches, tmp_path):
-    out = tmp_path / "table.csv"
-    words = (*patches, "--grid", f"orient=3 {SMALL}", "-o", out)
-    assert run(*words).exit_code == 0
-    out.write_bytes(b"\xef\xbb\xbf" + out.read_bytes().replace(b"\n", b"\r\n"))
-    words = (*patches, "--grid", f"orient=3,4 {SMALL}", "-o", out)
-    assert run(*words).exit_code == 0
-    assert list(read_results(out)["orient"]) == [3, 4]
-
-
 def test_a_single_patch_of_each_class(patches, tmp_path):
     words = []
     for name, folder in (("--vehicles", patches[1]), ("--non-vehicles", patches[3])):
@@ -149,15 +145,3 @@ def test_a_single_patch_of_each_class(patches, tmp_path):
         words += [name, tmp_path / name]
     message = commands.refuse("tune", *words, "--grid", "orient=3", "-o", tmp_path / "t.csv")
     assert "--vehicles and --non-vehicles must hold a folder of two or more patches; add" in message
-
-
-def test_a_cache_on_a_full_disk(patches, tmp_path, monkeypatch):
-    def fail(*_, **__):
-        raise OSError("439872 requested and 16352 written")  # as numpy says it
-
-    monkeypatch.setattr(np, "save", fail)
-    words = ("--grid", f"orient=3 {SMALL}", "-o", tmp_path / "t.csv", "--cache", tmp_path / "cache")
-    result = run(*patches, *words)
-    assert result.exit_code == 2
-    message = result.stderr.splitlines()[-1]  # below the progress bar
-    assert re.search(r"\.npy cannot be written \(No space left on device\); free some space", message)

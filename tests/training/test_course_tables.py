@@ -26,7 +26,7 @@ def test_the_course_tables_are_written(patch_set, tmp_path, monkeypatch):
     command = ["--data", str(tmp_path), "--out", str(out)]
     course_tables.main(command)
     page = (out / "results.md").read_text(encoding="utf-8")
-    rows = (out / "results" / "rows.csv").read_bytes()
+    rows = (out / "results" / "rows.jsonl").read_bytes()
     assert page.count("\n## ") == 9
     assert "| random | 96 | 24 |" in page
     assert "## The shipped model" in page
@@ -40,4 +40,4 @@ def test_the_course_tables_are_written(patch_set, tmp_path, monkeypatch):
     # A second run measures nothing.
     count_trials(monkeypatch, stop_after=0)
     course_tables.main(command)
-    assert (out / "results" / "rows.csv").read_bytes() == rows
+    assert (out / "results" / "rows.jsonl").read_bytes() == rows

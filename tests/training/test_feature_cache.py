@@ -1,5 +1,3 @@
-import logging
-
 import numpy as np
 import pytest
 
@@ -33,33 +31,3 @@ def test_the_least_recently_used_features_are_dropped(patch_set):
         features.all(params, mirrored=mirrored)
     assert list(features._in_memory) == [(one, False), (one, True)]
     assert len(FeatureCache(patch_set.patches, memory_mb=0).all(one)) == 120
-
-
-def test_features_stay_on_disk(patch_set, tmp_path, monkeypatch, caplog):
-    folder = tmp_path / "new" / "features"
-    expected = FeatureCache(patch_set.patches, folder=folder).all(PARAMS)
-    (file,) = folder.iterdir()
-    computed = []
-
-    def counted(patches, *arguments, **options):
-        computed.append(len(patches))
-        return extract_features(patches, *arguments, **options)
-
-    monkeypatch.setattr(feature_cache, "extract_features", counted)
-    np.testing.assert_array_equal(FeatureCache(patch_set.patches, folder=folder).all(PARAMS), expected)
-    assert max(computed) < 10  # Only the rows that are checked.
-    FeatureCache(patch_set.patches[:50], folder=folder).all(PARAMS)
-    assert max(computed) == 50
-    data = file.read_bytes()
-    for damaged, message in (
-        (data[: len(data) // 2], "are damaged"),
-        (b"", "are damaged"),
-        (data[:200] + bytes(len(data) - 200), "are from another release"),
-    ):
-        caplog.clear()
-        file.write_bytes(damaged)
-        with caplog.at_level(logging.WARNING):
-            found = FeatureCache(patch_set.patches, folder=folder).all(PARAMS)
-        np.testing.assert_array_equal(found, expected)
-        assert message in caplog.text
-        assert file.read_bytes() == data

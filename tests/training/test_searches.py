@@ -22,7 +22,7 @@ def test_the_best_search_comes_first(frames):
     assert table["f1"].iloc[0] > 0
     assert set(table["scales"]) == set(scales)
     assert (table["recall"][table["threshold"] == 200] == 0).all()
-    assert (table["ms"] > 0).all()
+    assert (table["search_ms"] > 0).all()
 
 
 @pytest.mark.parametrize(

@@ -6,17 +6,13 @@ from tests.training.trial_cases import SEARCH, SMALL, SMALL_GRID, UNTIMED, count
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.training import (
-    Halving,
     TrialOptions,
     compare_configurations,
     expand_grid,
-    pareto_front,
     parse_grid,
     read_results,
-    search_parameters,
 )
-from vehicle_detection.training.trials import COLUMNS, Trials
-from vehicle_detection.training.tuning import make_folds
+from vehicle_detection.training.trials import COLUMNS
 
 
 def compare(patch_set, configurations, **options):
@@ -90,8 +86,8 @@ def test_impossible_combinations_are_reported_and_skipped(patch_set, caplog):
         ({"C": ()}, "C must be a number or several; got none"),
         ({"seeds": ()}, "seeds must be a list of different integers, such as range"),
         ({"seeds": (1, 1)}, "seeds must be a list of different integers"),
-        ({"store": "rows.txt"}, "store must end in .csv or .jsonl; got 'rows.txt'"),
-        ({"store": "missing/rows.csv"}, "store needs an existing folder"),
+        ({"store": "rows.csv"}, "store must end in .jsonl, got 'rows.csv'"),
+        ({"store": "missing/rows.jsonl"}, "store needs an existing folder"),
     ],
 )
 def test_invalid_arguments_of_compare_configurations(patch_set, options, message):
@@ -109,6 +105,10 @@ def test_invalid_arguments_of_compare_configurations(patch_set, options, message
         ("=8", "got '=8'"),
         ("orient=8 orient=9", "grid names orient twice"),
         ("color=LAB", "grid has the unknown option 'color'"),
+        (
+            f"orient={','.join(map(str, range(400)))} hist_bins={','.join(map(str, range(400)))}",
+            "at most 100000",
+        ),
     ],
 )
 def test_the_text_of_a_grid(text, message):
@@ -116,15 +116,28 @@ def test_the_text_of_a_grid(text, message):
     assert grid["hog_channel"] + grid["C"] + grid["mirror"] == ["ALL", 0, 1e-4, 1, True, False]
     assert len(expand_grid(grid)) == 32
     with pytest.raises(InvalidInputError, match=message):
-        parse_grid(text)
+        expand_grid(parse_grid(text))
+
+
+@pytest.mark.parametrize(
+    ("grid", "message"),
+    [
+        ({}, r"grid must map option names \(color_space, .*\) to lists of values; got"),
+        ({"orient": 8}, r"grid\['orient'\] must be a list of values; got 8"),
+        ({"color_space": "LAB"}, r"grid\['color_space'\] must be a list of values"),
+        ({"orient": []}, r"grid\['orient'\] must hold at least one value"),
+    ],
+)
+def test_invalid_grids(grid, message):
+    with pytest.raises(InvalidInputError, match=message):
+        expand_grid(grid)
 
 
 # The store
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".jsonl"])
-def test_a_second_run_measures_only_what_is_new(patch_set, tmp_path, monkeypatch, suffix):
-    store = tmp_path / f"rows{suffix}"
+def test_a_second_run_measures_only_what_is_new(patch_set, tmp_path, monkeypatch):
+    store = tmp_path / "rows.jsonl"
     options = {"splits": "random", "seeds": (0, 1), "store": store}
     first = compare(patch_set, {"a": SMALL, "bad": {"orient": 0}}, **options)
     tried = count_trials(monkeypatch)
@@ -140,7 +153,7 @@ def test_a_second_run_measures_only_what_is_new(patch_set, tmp_path, monkeypatch
 
 
 def test_rows_of_other_patches_splits_and_frames_are_not_used(patch_set, frames, tmp_path, monkeypatch):
-    store = tmp_path / "rows.csv"
+    store = tmp_path / "rows.jsonl"
     tried = count_trials(monkeypatch)
     compare(patch_set, [SMALL], store=store)
     changed = PatchSet(patch_set.patches[:, ::-1].copy(), patch_set.labels, patch_set.names)
@@ -171,127 +184,3 @@ def test_an_interrupted_run_continues_from_its_store(patch_set, tmp_path, monkey
     assert len(tried) == 2
     pd.testing.assert_frame_equal(without_times(resumed), without_times(complete))
     pd.testing.assert_frame_equal(read_results(store), resumed)
-
-
-# search_parameters
-
-
-def test_halving_keeps_the_better_and_measures_the_best_in_full(patch_set, frames):
-    grid = {**SMALL_GRID, "orient": [0, 4, 6], "C": [1e-9, 1e-3, 1.0]}
-    options = TrialOptions(frames=frames, search_params=SEARCH)
-    table = search_parameters(patch_set, grid, halving=Halving(n_finalists=2, n_folds=2), options=options)
-    assert table["stage"].unique().tolist() == ["grid", "halving", "final"]
-    assert table[table["stage"] == "grid"]["status"].tolist() == ["failed"] * 3
-    halving = table[table["stage"] == "halving"]
-    # 120 patches are too few for more than one round: 6 configurations on 2 folds.
-    assert len(halving) == 12
-    assert set(halving["split"]) == {"sequences, fold 1 of 2", "sequences, fold 2 of 2"}
-    assert halving["search_ms"].isna().all()
-    means = halving.groupby(["orient", "C"], sort=False)["accuracy"].mean()
-    final = table[table["stage"] == "final"]
-    assert len(final) == 2
-    assert tuple(final[["orient", "C"]].iloc[0]) == means.idxmax()
-    assert final["split"].tolist() == ["sequences"] * 2
-    assert (final["search_ms"] > 0).all()
-    assert final["frame_f1"].notna().all()
-    assert len(pareto_front(final)) >= 1
-
-
-def larger(patch_set, times):
-    """The patches several times, each copy a little brighter."""
-    copies = []
-    for number in range(times):
-        names = [name.replace("/", f"/{number}_", 1) for name in patch_set.names]
-        brighter = (patch_set.patches // 2 + 10 * number).astype(np.uint8)
-        copies.append(PatchSet(brighter, patch_set.labels, names))
-    return PatchSet.concatenate(copies)
-
-
-def test_later_rounds_use_fewer_configurations_and_more_patches(patch_set):
-    many = larger(patch_set, 8)
-    grid = {**SMALL_GRID, "C": [1e-9, 1e-5, 1e-3, 1.0]}
-    halving = Halving(n_folds=2, factor=2, n_finalists=0)
-    table = search_parameters(many, grid, split="random", halving=halving, random_state=1, options=UNTIMED)
-    rounds = table.groupby(table["train_size"] + table["test_size"])["C"].unique()
-    assert [len(values) for values in rounds] == [4, 2]
-    assert rounds.index[1] == pytest.approx(2 * rounds.index[0], rel=0.01)
-    assert 1e-9 not in rounds.iloc[1]
-
-
-def test_an_interrupted_search_continues_from_its_store(patch_set, tmp_path, monkeypatch):
-    many = larger(patch_set, 8)
-    grid = {**SMALL_GRID, "C": [1e-5, 1e-4, 1e-3], "orient": [3, 4, 5]}
-    options = {"split": "groups", "halving": Halving(n_folds=2, n_finalists=2), "options": UNTIMED}
-    store = tmp_path / "rows.csv"
-    with monkeypatch.context() as patched:
-        count_trials(patched, stop_after=13)
-        with pytest.raises(KeyboardInterrupt):
-            search_parameters(many, grid, store=store, **options)
-    assert len(read_results(store)) == 13
-    tried = count_trials(monkeypatch)
-    resumed = search_parameters(many, grid, store=store, **options)
-    n_resumed = len(tried)
-    fresh = search_parameters(many, grid, **options)
-    assert len(tried) - n_resumed == n_resumed + 13
-    pd.testing.assert_frame_equal(without_times(fresh), without_times(resumed))
-
-
-def test_a_configuration_that_cannot_be_trained_is_dropped(patch_set, monkeypatch):
-    train = Trials.train
-
-    def train_others(self, candidate, *arguments):
-        if candidate.params.orient == 6:
-            raise InvalidInputError("too large")
-        return train(self, candidate, *arguments)
-
-    monkeypatch.setattr(Trials, "train", train_others)
-    grid = {**SMALL_GRID, "orient": [6, 4]}
-    table = search_parameters(patch_set, grid, split="random", halving=Halving(n_folds=2), options=UNTIMED)
-    halving = table[table["stage"] == "halving"]
-    assert halving[halving["orient"] == 6]["status"].tolist() == ["failed"] * 2
-    assert table[table["stage"] == "final"]["orient"].tolist() == [4]
-
-
-@pytest.mark.parametrize("split", ["sequences", "groups", "random"])
-def test_folds_cover_all_patches_without_leakage(patch_set, split):
-    copies = PatchSet(
-        np.concatenate([patch_set.patches, patch_set.patches // 2 + 20]),
-        np.tile(patch_set.labels, 2),
-        (*patch_set.names, *(name.replace(".png", "0.png") for name in patch_set.names)),
-    )
-    fold_of = make_folds(copies, split, 3, seed=0)
-    assert set(fold_of) == {0, 1, 2}
-    assert np.bincount(fold_of).min() > 240 / 3 * 0.6
-    if split == "groups":
-        np.testing.assert_array_equal(fold_of[:120], fold_of[120:])
-    if split == "sequences":
-        for source in set(copies.sources):
-            rows = np.flatnonzero(copies.sources == source)
-            numbers = [int(copies.names[row].rpartition("/")[2].removesuffix(".png")) for row in rows]
-            assert (np.diff(fold_of[rows][np.argsort(numbers)]) <= 0).all()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"grid": {}}, r"grid must map option names \(color_space, .*\) to lists of values; got"),
-        ({"grid": {"size": [1]}}, "grid has the unknown option 'size'; use"),
-        ({"grid": {"orient": 8}}, r"grid\['orient'\] must be a list of values; got 8"),
-        ({"grid": {"color_space": "LAB"}}, r"grid\['color_space'\] must be a list of values"),
-        ({"grid": {"orient": []}}, r"grid\['orient'\] must hold at least one value"),
-        ({"grid": {"orient": [0, 500]}}, "grid holds no possible combination: orient must be"),
-        ({"grid": {"orient": range(1, 181), "hist_bins": range(1, 257), "C": range(1, 9)}}, "at most 100000"),
-        ({"split": "gti_to_kitti"}, "split must be one of 'sequences', 'groups', 'random'"),
-        ({"halving": Halving(n_folds=90), "split": "random"}, "patch_set is too small for n_folds=90"),
-    ],
-)
-def test_invalid_arguments_of_search_parameters(patch_set, options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        search_parameters(patch_set, **{"grid": {"orient": [4]}, "options": UNTIMED, **options})
-
-
-def test_a_fold_with_one_class_is_rejected(patch_set):
-    names = [f"all/{row}.png" for row in range(120)]
-    sorted_by_class = PatchSet(patch_set.patches, patch_set.labels, names)
-    with pytest.raises(InvalidInputError, match=r"fold 1 of n_folds=2, or the rest .* lacks vehicles or"):
-        search_parameters(sorted_by_class, {"orient": [4]}, halving=Halving(n_folds=2))

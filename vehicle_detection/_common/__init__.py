@@ -56,7 +56,6 @@ from vehicle_detection._common.text import (
 from vehicle_detection._common.threads import (
     JOBS_VARIABLE,
     NEW_ARRAYS,
-    SPARE,
     Closing,
     ThreadTeam,
     Workspace,
@@ -64,7 +63,6 @@ from vehicle_detection._common.threads import (
     call_in_thread,
     resolve_jobs,
     single_threaded_opencv,
-    with_spare,
 )
 from vehicle_detection._common.units import ROUGH_DISTANCE, UNITS, Units, format_with_error
 from vehicle_detection._common.web import download_bytes

@@ -222,10 +222,6 @@ class ThreadTeam(Closing):
 _MAX_VIEWS = 4096
 
 
-SPARE = 64
-"""Entries beyond the end of each array of a workspace: vectors are loaded there, and not used."""
-
-
 class Workspace(threading.local):
     """Scratch arrays by name, of each thread its own; with ``reuse=False`` each array is newly allocated."""
 
@@ -236,29 +232,18 @@ class Workspace(threading.local):
 
     def take(self, shape: tuple[int, ...], dtype: Any, name: str) -> NDArray[Any]:
         """Return an uninitialized array of `shape`; arrays of the same name and dtype share their memory."""
-        size = math.prod(shape)
         if not self._reuse:
-            return np.empty(size + SPARE, dtype)[:size].reshape(shape)
+            return np.empty(shape, dtype)
+        size = math.prod(shape)
         view = self._views.get((dtype, name, shape))
         if view is None:
             array = self._arrays.get((dtype, name))
-            if array is None or array.size < size + SPARE or len(self._views) == _MAX_VIEWS:
+            if array is None or array.size < size or len(self._views) == _MAX_VIEWS:
                 self._views.clear()  # also those of the smaller array
-            if array is None or array.size < size + SPARE:
-                array = self._arrays[dtype, name] = np.empty(size + SPARE, dtype)
+            if array is None or array.size < size:
+                array = self._arrays[dtype, name] = np.empty(size, dtype)
             view = self._views[dtype, name, shape] = array[:size].reshape(shape)
         return view
-
-
-def with_spare(array: NDArray[Any]) -> NDArray[Any]:
-    """Return an array itself if its memory goes on for `SPARE` entries, as in a workspace, else a copy."""
-    if isinstance(array.base, np.ndarray) and array.base.flags.c_contiguous:
-        start, base_start = (each.__array_interface__["data"][0] for each in (array, array.base))
-        if base_start + array.base.nbytes - start - array.nbytes >= SPARE * array.itemsize:
-            return array
-    copy = NEW_ARRAYS.take(array.shape, array.dtype, "")
-    copy[...] = array
-    return copy
 
 
 NEW_ARRAYS = Workspace(reuse=False)

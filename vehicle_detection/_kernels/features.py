@@ -1,4 +1,4 @@
-"""Numba kernels of the features, of patches and of all windows of a band: HOG, histograms and spatial bins.
+"""Numba kernels of the features, of patches and of all windows of a band, and of the scores of the windows.
 
 All arrays are row-major and images interleaved: a row of an ``(H, W, C)`` image is ``W * C`` values, in which
 the left and right neighbors of a value are `C` positions away. Every inner loop runs over adjacent values,
@@ -8,11 +8,13 @@ which the compiler vectorizes, for any number of channels.
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._kernels.jit import jit
+from vehicle_detection.errors import InvalidInputError
 
 
 @functools.cache
@@ -38,19 +40,39 @@ def bin_of_value(bins: int) -> NDArray[np.intp]:
     return np.arange(256, dtype=np.intp) * bins // 256
 
 
-def sqrt_gradients(source: NDArray[np.uint8 | np.floating]) -> tuple[NDArray[np.float64], ...]:
-    """Gradients of the square root of images, and their arctangents, as scikit-image computes them.
+def sqrt_gradients(image: NDArray[np.uint8 | np.floating]) -> tuple[NDArray[np.float64], ...]:
+    """Gradients of the square root of an image, and their arctangents, as scikit-image computes them.
 
-    `source` is ``(..., H, W, C)`` uint8 or float, not negative. Returns ``gx``, ``gy`` and
-    ``arctan2(gy, gx)``, ``(..., H, W * C)`` float64.
+    `image` is ``(H, W, C)`` uint8 or float, not negative. Returns ``gx``, ``gy`` and ``arctan2(gy, gx)``,
+    ``(H, W * C)`` float64.
     """
-    root = np.sqrt(np.arange(256.0))[source] if source.dtype == np.uint8 else np.sqrt(source)
+    root = np.sqrt(np.arange(256.0))[image] if image.dtype == np.uint8 else np.sqrt(image)
     gx, gy = np.zeros_like(root), np.zeros_like(root)
-    np.subtract(root[..., :, 2:, :], root[..., :, :-2, :], out=gx[..., :, 1:-1, :])
-    np.subtract(root[..., 2:, :, :], root[..., :-2, :, :], out=gy[..., 1:-1, :, :])
-    shape = (*root.shape[:-2], -1)
-    gx, gy = (part.reshape(shape).astype(np.float64, copy=False) for part in (gx, gy))
+    np.subtract(root[:, 2:], root[:, :-2], out=gx[:, 1:-1])
+    np.subtract(root[2:], root[:-2], out=gy[1:-1])
+    gx, gy = (part.reshape(len(root), -1).astype(np.float64, copy=False) for part in (gx, gy))
     return gx, gy, np.arctan2(gy, gx)
+
+
+def hog_cells(image: NDArray[Any], orient: int, cell: int, transform_sqrt: bool) -> NDArray[np.float32]:
+    """Orientation histograms of an image's cells: ``(channels, orient, rows, columns)``.
+
+    Equals the first stage of scikit-image's HOG; `image` is ``(H, W, channels)``, uint8 or float.
+    Without `transform_sqrt`, a gradient of floats exactly on a bound of bins may fall into the other one.
+    """
+    height, width, channels = image.shape
+    cells = np.empty((channels, orient, height // cell, width // cell), np.float32)
+    if transform_sqrt:
+        if image.dtype != np.uint8 and image.min() < 0:
+            raise InvalidInputError(
+                "transform_sqrt must be False for negative values, which float LUV and LAB images have; "
+                "convert a uint8 image, or switch it off"
+            )
+        sum_orientations(*sqrt_gradients(image), degree_bounds(orient), channels, cell, cells)
+    else:
+        flat = np.ascontiguousarray(image).reshape(height, -1)
+        sum_magnitudes(flat, channels, cell, orientation_cotangents(orient), cells)
+    return cells
 
 
 # Columns of a tile: its gradients and histograms (10 rows of floats) fit into the first-level cache.
@@ -58,7 +80,7 @@ _TILE = 768
 
 
 @jit
-def hog_cells(image, channels, cell, cotangents, cells):
+def sum_magnitudes(image, channels, cell, cotangents, cells):
     """Sum gradient magnitudes into the orientation histograms of cells.
 
     `image` is ``(H, W * channels)`` uint8 or float and at least as large as the cells, `cell` their side in
@@ -186,7 +208,7 @@ def sum_orientations(gx, gy, angles, bounds, channels, cell, cells):
     """Sum gradient magnitudes into the orientation histograms of cells, from known angles.
 
     `gx`, `gy` and `angles` (radians) are ``(H, W * channels)`` float64, `bounds` ``(orient + 1,)`` float64 in
-    degrees; the rest is as for `hog_cells`. This is for square-rooted images: their gradients are often
+    degrees; the rest is as for `sum_magnitudes`. This is for square-rooted images: their gradients are often
     exactly on a bound, where only the reference's own arctangent gives the reference's bin.
     """
     orient, rows, columns = cells.shape[1], cells.shape[2], cells.shape[3]
@@ -209,24 +231,24 @@ def sum_orientations(gx, gy, angles, bounds, channels, cell, cells):
     cells *= np.float32(1.0 / (cell * cell))
 
 
-@jit
-def pool_cells(cells, pooled):
+def pool_cells(cells: NDArray[np.float32]) -> NDArray[np.float32]:
     """Average each cell with its neighbors to the right, below and diagonally: cells of twice the side.
 
     ``pooled[c, k, y, x]`` is the mean of ``cells[c, k, y : y + 2, x : x + 2]``; the last row and column are
     zero.
     """
+    pooled = np.zeros_like(cells)
+    pairs = cells[..., :-1] + cells[..., 1:]
+    pooled[..., :-1, :-1] = (pairs[..., :-1, :] + pairs[..., 1:, :]) * np.float32(0.25)
+    return pooled
+
+
+def hog_blocks(cells: NDArray[np.float32], block: int, dilation: int = 1) -> NDArray[np.float32]:
+    """Normalize the blocks that start at each cell: ``(channels, block, block, orient, rows, columns)``."""
     channels, orient, rows, columns = cells.shape
-    quarter = np.float32(0.25)
-    for channel in range(channels):
-        for k in range(orient):
-            for y in range(rows - 1):
-                above, below = cells[channel, k, y], cells[channel, k, y + 1]
-                out = pooled[channel, k, y]
-                for x in range(columns - 1):
-                    out[x] = ((above[x] + above[x + 1]) + (below[x] + below[x + 1])) * quarter
-                out[columns - 1] = np.float32(0)
-            pooled[channel, k, rows - 1] = np.float32(0)
+    blocks = np.empty((channels, block, block, orient, rows, columns), np.float32)
+    normalize_blocks(cells, block, dilation, blocks)
+    return blocks
 
 
 @jit
@@ -234,7 +256,7 @@ def normalize_blocks(cells, block, dilation, blocks):
     """Normalize overlapping blocks of cells by L2-Hys: L2, clip at 0.2, L2 again.
 
     `block` is the side of a block in cells and `dilation` the distance of its cells: 1, or 2 for
-    `pool_cells`. `blocks` is the output ``(channels, block, block, orient, cell rows, cell columns)``
+    pooled ones. `blocks` is the output ``(channels, block, block, orient, cell rows, cell columns)``
     float32: ``blocks[c, i, j, k, y, x]`` is the value of cell ``[y + i * dilation, x + j * dilation]`` in the
     block that starts at cell ``[y, x]``. The last ``(block - 1) * dilation`` rows and columns start no block
     and are zero.
@@ -285,67 +307,6 @@ def normalize_blocks(cells, block, dilation, blocks):
                         for x in range(width):
                             out[x] *= clipped[x]
                         out[width:].fill(np.float32(0))
-
-
-@jit
-def arrange_blocks(blocks, positions, dilation, features):
-    """Write the blocks of one patch (see `normalize_blocks`) as a 1-D vector in scikit-image's order.
-
-    The order is channel, block row, block column, cell row, cell column, orientation, with `positions` blocks
-    along each side of the patch, `dilation` cells apart.
-    """
-    channels, block, orient = blocks.shape[0], blocks.shape[1], blocks.shape[3]
-    index = 0
-    for channel in range(channels):
-        for y in range(positions):
-            for x in range(positions):
-                for i in range(block):
-                    for j in range(block):
-                        for k in range(orient):
-                            features[index] = blocks[channel, i, j, k, y * dilation, x * dilation]
-                            index += 1
-
-
-@jit
-def normalize_patch(cells, block, coarse, blocks, features):
-    """Write the normalized blocks of one patch as a vector, followed by `coarse` x `coarse` pooled blocks."""
-    positions = cells.shape[2] - block + 1
-    normalize_blocks(cells, block, 1, blocks)
-    fine = cells.shape[0] * positions * positions * block * block * cells.shape[1]
-    arrange_blocks(blocks, positions, 1, features[:fine])
-    if coarse > 0:
-        pooled = np.empty_like(cells)
-        pool_cells(cells, pooled)
-        normalize_blocks(pooled, block, 2, blocks)
-        arrange_blocks(blocks, coarse, 2, features[fine:])
-
-
-@jit
-def patch_hog(patches, channels, cell, block, coarse, cotangents, features):
-    """HOG of each patch ``(N, side, side * channels)`` uint8; see `hog_cells`.
-
-    `coarse` is the number of block positions of the coarse HOG along a side, 0 for none. `features` is the
-    output ``(N, channels * (positions**2 + coarse**2) * block**2 * orient)`` float32.
-    """
-    orient = len(cotangents)
-    side = patches.shape[1] // cell
-    cells = np.empty((channels, orient, side, side), np.float32)
-    blocks = np.empty((channels, block, block, orient, side, side), np.float32)
-    for index in range(len(patches)):
-        hog_cells(patches[index], channels, cell, cotangents, cells)
-        normalize_patch(cells, block, coarse, blocks, features[index])
-
-
-@jit
-def patch_hog_from_angles(gx, gy, angles, bounds, channels, cell, block, coarse, features):
-    """HOG of each patch from known gradients ``(N, side, side * channels)``; see `sum_orientations`."""
-    orient = len(bounds) - 1
-    side = gx.shape[1] // cell
-    cells = np.empty((channels, orient, side, side), np.float32)
-    blocks = np.empty((channels, block, block, orient, side, side), np.float32)
-    for index in range(len(gx)):
-        sum_orientations(gx[index], gy[index], angles[index], bounds, channels, cell, cells)
-        normalize_patch(cells, block, coarse, blocks, features[index])
 
 
 @jit
@@ -509,19 +470,31 @@ def _sum_windows(count, window, wide):
         span *= 2
 
 
-@jit
-def spatial_cells(bins, per_cell, cells):
-    """Split the spatial bins of a band into one channel for each position of a bin in its cell.
+@functools.partial(jit, reorder=True)
+def add_correlation(channels, weights, dilation, scores):
+    """Add each window's weighted sum of channels to its score, in place.
 
-    `bins` is ``(H, W, 3)`` uint8, the band resized to the bin grid, `per_cell` the number of bins along a
-    cell's side, and `cells` the output ``(3, per_cell, per_cell, cell rows, cell columns)`` float32.
+    `channels` is ``(channels, rows, columns)``, `weights` ``(window rows, window columns, channels)``, both
+    float32, and `scores` has a row and a column for each position of the window. Neighboring cells of a
+    window are `dilation` cells apart. Four channels are added at a time, so that a score is loaded and stored
+    once for four products, and all columns of the weights before the next channels, which stay in the cache.
     """
-    rows, columns = cells.shape[3], cells.shape[4]
-    for channel in range(3):
-        for i in range(per_cell):
-            for j in range(per_cell):
-                for y in range(rows):
-                    line = bins[y * per_cell + i]
-                    out = cells[channel, i, j, y]
-                    for x in range(columns):
-                        out[x] = line[x * per_cell + j, channel]
+    depth, (height, width) = channels.shape[0], scores.shape
+    whole = depth - depth % 4
+    for y in range(height):
+        out = scores[y]
+        for row in range(weights.shape[0]):
+            line = y + row * dilation
+            for k in range(0, whole, 4):
+                for column in range(weights.shape[1]):
+                    x, w = column * dilation, weights[row, column, k : k + 4]
+                    w0, w1, w2, w3 = w[0], w[1], w[2], w[3]
+                    v0, v1 = channels[k, line, x:], channels[k + 1, line, x:]
+                    v2, v3 = channels[k + 2, line, x:], channels[k + 3, line, x:]
+                    for i in range(width):
+                        out[i] += (w0 * v0[i] + w1 * v1[i]) + (w2 * v2[i] + w3 * v3[i])
+            for k in range(whole, depth):
+                for column in range(weights.shape[1]):
+                    weight, values = weights[row, column, k], channels[k, line, column * dilation :]
+                    for i in range(width):
+                        out[i] += weight * values[i]

@@ -8,7 +8,7 @@ import gc
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numba
 from numba.core import event
@@ -64,16 +64,6 @@ def _save(save: Callable[..., None], *overload: Any) -> None:
         save(*overload)
     except OSError as error:
         log.info("compiled kernels are not kept: %s", error)
-
-
-def compiles(kernel: Callable[..., Any], *types: Any) -> bool:
-    """Compile a kernel for arguments of these types; log a warning and return False if that fails."""
-    try:
-        cast("Any", kernel).compile(types)
-    except (numba.core.errors.NumbaError, RuntimeError) as error:  # LLVM's are RuntimeErrors
-        log.warning("products are computed without vector instructions, which is slower: %s", error)
-        return False
-    return True
 
 
 @functools.cache

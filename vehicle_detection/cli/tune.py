@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import vehicle_detection as vd
-from vehicle_detection.cli.options import NON_VEHICLES, PATCHES, VEHICLES, flag, option
+from vehicle_detection.cli.options import PATCHES, option
 from vehicle_detection.cli.output import (
     check_targets,
     option_names,
@@ -28,74 +28,113 @@ _MAX_ROWS = 15
 @option_names(
     random_state="--seed",
     seeds="--seed",
-    n_finalists="--finalists",
     store="--output",
+    scales="--grid",
+    overlaps="--grid",
+    thresholds="--grid",
     patches_or_labels=PATCHES,
     patch_set=PATCHES,
 )
 def tune(
-    vehicles: Path = VEHICLES,
-    non_vehicles: Path = NON_VEHICLES,
-    grid: str = option(..., "GRID", "Values to try: 'orient=8,9 color_space=YCrCb,LAB C=1e-4,1'."),
+    grid: str = option(
+        ...,
+        "GRID",
+        "Values to try: 'orient=8,9 color_space=YCrCb,LAB C=1e-4,1', or of the search of a trained model: "
+        "'scales=1,0.8+1+1.5 overlap=0.5,0.75 threshold=1,4'.",
+    ),
     output: Path = option(
         ...,
         "FILE.csv",
-        "Table to write: .csv, .jsonl or .parquet. Results are saved one by one; the same command "
-        "resumes an interrupted run.",
+        "Table to write: .csv, .jsonl or .parquet. Trained models are saved one by one in a .jsonl file; the "
+        "same command resumes an interrupted run.",
         "-o",
         "--output",
     ),
+    vehicles: Path | None = option(None, "PATH", "Folder or zip of patches of vehicles to train on."),
+    non_vehicles: Path | None = option(None, "PATH", "Folder or zip of other patches."),
+    model: str = option("highway", "FILE", "Model whose search is varied."),
     plot: Path | None = option(None, "FILE.png", "Accuracy against search time."),
     split: str = option("sequences", "sequences|groups|random", "Held-out patches."),
-    halving: bool = flag("--halving", "Eliminate poor configurations on few patches (successive halving)."),
-    finalists: int = option(3, "N", "Configurations to measure fully after --halving."),
     frames: Path | None = option(None, "DIR", "Labelled frames to score models on, such as test_images."),
     labels: Path | None = option(None, "FILE.csv", "True boxes of --frames."),
     horizon: float | None = option(None, "F", "Horizon of --frames, 0 (top) to 1, such as 0.55."),
     seed: int = option(0, "N", "Random seed of splits and training."),
-    cache: Path | None = option(None, "DIR", "Folder to keep features in, such as cache."),
 ) -> None:
-    """Train and measure every combination of a grid of parameters, and show the best."""
-    from vehicle_detection._common import check_choice, check_integer, check_suffix
+    """Measure every combination of a grid of parameters, of training or of the search, and show the best."""
+    from vehicle_detection._common import check_choice, check_suffix
 
-    training = vd.training
-    values = training.parse_grid(grid)
+    values = vd.training.parse_grid(grid)
     check_choice(split, "--split", ("sequences", "groups", "random"))
-    check_integer(finalists, "--finalists", low=1)
-    sources = {"--vehicles": vehicles, "--non-vehicles": non_vehicles}
-    targets = check_targets({"--output": output, "--plot": plot}, sources)
+    sources = {"--vehicles": vehicles, "--non-vehicles": non_vehicles, "--labels": labels}
+    given = {name: path for name, path in sources.items() if path is not None}
+    targets = check_targets({"--output": output, "--plot": plot}, given)
     check_suffix(output, "--output", (".csv", ".jsonl", ".parquet"))
     if plot is not None:
         check_suffix(plot, "--plot", (".png", ".svg", ".pdf"))
     labelled = _read_frames(frames, labels, horizon)
-    # Rows cannot be appended to Parquet, so they are stored in a .jsonl file beside it.
-    parquet = output.suffix.lower() == ".parquet"
-    store = output.with_suffix(".jsonl") if parquet else output
+    if set(values) <= set(_SEARCH):
+        if labelled is None:
+            raise InvalidInputError("--grid of a search needs labelled frames; give --frames and --labels")
+        table = run_interruptible(lambda: _compare_searches(model, labelled, values))
+        look = {"quality": "f1", "label": "scales"}
+    else:
+        if vehicles is None or non_vehicles is None:
+            raise InvalidInputError(f"--grid of features needs patches to train on; give {PATCHES}")
+        options = {"splits": split, "seeds": (seed,), "store": output.with_suffix(".jsonl")}
+        options["options"] = vd.training.TrialOptions(frames=labelled)
+        table, look = _compare_models((vehicles, non_vehicles), values, options), {}
+    if output.suffix.lower() != ".jsonl" or set(values) <= set(_SEARCH):
+        vd.training.write_results(table, output)
+    if plot is not None:
+        _draw(table, plot, look)
+    print_line(f"wrote {', '.join(map(str, targets))}")
+
+
+# Arguments of `compare_searches` by the names in a grid, which are those of its columns.
+_SEARCH = {"scales": "scales", "overlap": "overlaps", "threshold": "thresholds"}
+
+
+def _compare_searches(
+    model: str, frames: vd.LabelledFrames, values: Mapping[str, Sequence[Any]]
+) -> DataFrame:
+    """Measure the searches of a model in labelled frames, and show the best."""
+    lists: dict[str, Any] = {_SEARCH[name]: each for name, each in values.items()}
+    if "scales" in lists:
+        try:
+            lists["scales"] = [tuple(map(float, str(each).split("+"))) for each in lists["scales"]]
+        except ValueError:
+            raise InvalidInputError(
+                f"--grid must join scales by +, as in 'scales=1,0.8+1+1.5'; got {lists['scales']}"
+            ) from None
+    table = vd.training.compare_searches(vd.load_classifier(model), frames, **lists)
+    table["scales"] = ["+".join(f"{side:g}" for side in sides) for sides in table["scales"]]
+    rows = [
+        [each if isinstance(each, str) else "" if math.isnan(each) else f"{each:.3g}" for each in row]
+        for row in table.head(_MAX_ROWS).itertuples(index=False)
+    ]
+    print_table(f"{len(table)} searches, best first", list(table.columns), rows)
+    return table
+
+
+def _compare_models(
+    sources: tuple[Path, Path], values: Mapping[str, Sequence[Any]], options: dict[str, Any]
+) -> DataFrame:
+    """Train and measure models, and show the best."""
+    store = options["store"]
     is_new = not store.exists()
-    measured = training.TrialOptions(frames=labelled, cache=cache)
-    options: dict[str, Any] = {"store": store, "options": measured, "progress": True}
 
     def work() -> DataFrame:
-        patches = vd.load_training_patches(vehicles, non_vehicles, progress=sys.stderr.isatty())
-        if halving:
-            chosen = training.Halving(n_finalists=finalists)
-            options.update(split=split, halving=chosen, random_state=seed)
-            return training.search_parameters(patches, values, **options)
-        options.update(splits=split, seeds=(seed,))
-        return training.compare_configurations(patches, training.expand_grid(values), **options)
+        patches = vd.load_training_patches(*sources, progress=sys.stderr.isatty())
+        configurations = vd.training.expand_grid(values)
+        return vd.training.compare_configurations(patches, configurations, progress=True, **options)
 
     table = run_interruptible(work)
-    final = table[table["stage"] == ("final" if halving else "compare")]
-    _show(final, table, values)
-    if final["accuracy"].isna().all():
+    _show(table, values)
+    if table["accuracy"].isna().all():
         if is_new:
             store.unlink(missing_ok=True)
         raise InvalidInputError("--grid has no configuration that can be trained, for the reasons above")
-    if parquet:
-        training.write_results(table, output)
-    if plot is not None:
-        _draw(final, plot)
-    print_line(f"wrote {', '.join(map(str, targets))}")
+    return table
 
 
 def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None) -> vd.LabelledFrames | None:
@@ -109,10 +148,10 @@ def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None
     return vd.LabelledFrames(name, vd.load_frames(frames), true, horizon)
 
 
-def _show(final: DataFrame, table: DataFrame, grid: Mapping[str, Sequence[Any]]) -> None:
+def _show(table: DataFrame, grid: Mapping[str, Sequence[Any]]) -> None:
     """Print the best rows, with a star on the Pareto front, and the errors of failed configurations."""
-    measured = final[final["accuracy"].notna()].sort_values("accuracy", ascending=False, kind="stable")
-    front = set(vd.training.pareto_front(final)["trial"])
+    measured = table[table["accuracy"].notna()].sort_values("accuracy", ascending=False, kind="stable")
+    front = set(vd.training.pareto_front(table)["trial"])
     # Options of which the grid has several values; the configuration is a name for the features.
     swept = [name for name, each in grid.items() if name != "C" and len(each) > 1]
     heads = ["", "configuration", *swept, "C", "accuracy", "training", "search ms"]
@@ -136,12 +175,12 @@ def _text(value: float, digits: int) -> str:
     return "" if math.isnan(value) else f"{value:.{digits}f}"
 
 
-def _draw(table: DataFrame, path: Path) -> None:
+def _draw(table: DataFrame, path: Path, look: Mapping[str, str]) -> None:
     from matplotlib.figure import Figure
 
     from vehicle_detection._common import atomic_write
 
     figure = Figure(figsize=(7, 4.5), layout="constrained")
-    vd.notebook.plot_tradeoff(table, ax=figure.subplots())
+    vd.notebook.plot_tradeoff(table, ax=figure.subplots(), **look)
     with atomic_write(path) as part:
         figure.savefig(part)

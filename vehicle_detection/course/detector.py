@@ -46,7 +46,7 @@ class HeatmapDetector:
     scales
         Sides of the windows divided by 64 pixels, for method 2, each alone or with its own rows and columns:
         ``(1.5, (400, 656), (0, 1280))``.
-    ystart, ystop
+    y_start_stop
         Rows for the other scales. All positions are those of a 1280x720 frame, and scale with it.
     threshold, n_frames
         A pixel is hot if more than this number of windows hit it, as the mean over so many frames. By default
@@ -80,14 +80,13 @@ class HeatmapDetector:
         *,
         method: Literal[1, 2] = 2,
         scales: Sequence[Any] = (0.8, 1.0, 1.5),
-        ystart: int = 400,
-        ystop: int = 656,
+        y_start_stop: Sequence[int] = (400, 656),
         threshold: float | None = None,
         n_frames: int = 5,
         smoother: BoxSmoother | Callable[[list[Corners]], Any] | None = None,
         **options: Any,
     ) -> None:
-        bands = read_bands(scales, (ystart, ystop))
+        bands = read_bands(scales, y_start_stop)
         self.find_windows: FindWindows = window_search(clf, scaler, method, bands, options)
         self.threshold = check_number(float(method) if threshold is None else threshold, "threshold", low=0)
         self.history: deque[NDArray[Any]] = deque(maxlen=check_integer(n_frames, "n_frames", low=1))

@@ -39,7 +39,6 @@ from vehicle_detection.course.versions import (
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import COLOR_SPACES, PATCH_SIZE, SPATIAL_ORDERS, FeatureParams
 from vehicle_detection.images import read_image
-from vehicle_detection.search import fill_hog_cells
 from vehicle_detection.svm import UNIT_CHANNELS
 
 Image = NDArray[Any]
@@ -288,17 +287,14 @@ def hog_blocks(
 ) -> NDArray[np.float32]:
     """HOG of each channel: ``(channels, rows, columns, block, block, orient)`` float32, a view."""
     cell, block = pix_per_cell, cell_per_block
-    height, width, channels = image.shape
+    height, width, _ = image.shape
     side = cell * block
     if min(height, width) < side:
         raise InvalidInputError(
             f"img must be at least one block large ({side}x{side} pixels); got {width}x{height}"
         )
-    cells = np.empty((channels, orient, height // cell, width // cell), np.float32)
-    fill_hog_cells(image, orient, cell, transform_sqrt, cells)
-    blocks = np.empty((channels, block, block, *cells.shape[1:]), np.float32)
-    kernels.normalize_blocks(cells, block, 1, blocks)
-    rows, columns = (count - block + 1 for count in cells.shape[2:])
+    blocks = kernels.hog_blocks(kernels.hog_cells(image, orient, cell, transform_sqrt), block)
+    rows, columns = height // cell - block + 1, width // cell - block + 1
     return blocks[..., :rows, :columns].transpose(0, 4, 5, 1, 2, 3)
 
 

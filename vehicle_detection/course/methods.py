@@ -23,7 +23,7 @@ from vehicle_detection.windows import find_cars as find_library_windows
 from vehicle_detection.windows import search_windows as search_library_windows
 
 # Scale, rows and columns.
-_Band = tuple[float, tuple[int, int], tuple[int, int]]
+_Band = tuple[float, Sequence[int], Sequence[int]]
 FindWindows = Callable[[NDArray[np.uint8]], Any]
 
 # Size, rows and overlap of the four lists of windows of the first system: 130 in a 1280x720 frame.
@@ -41,7 +41,7 @@ _FEATURES = {
 _FROZEN = ("divide_by", "cells_per_step", "transform_sqrt", "hist_range", "spatial_order")
 
 
-def read_bands(scales: Sequence[Any], rows: tuple[int, int]) -> list[_Band]:
+def read_bands(scales: Sequence[Any], rows: Sequence[int]) -> list[_Band]:
     """Scales with their rows and columns, checked."""
     bands, usual = [], (rows, (0, REFERENCE_WIDTH))
     for each in check_sequence(scales, "scales", "numbers"):
@@ -50,7 +50,7 @@ def read_bands(scales: Sequence[Any], rows: tuple[int, int]) -> list[_Band]:
         if len(pairs) > 2 or not all(_is_range(pair) for pair in pairs):
             raise InvalidInputError(
                 "scales must hold numbers, or (scale, (ystart, ystop), (xstart, xstop)) with start < stop; "
-                f"got {describe(each)} and the rows {rows}"
+                f"got {describe(each)} and y_start_stop={describe(rows)}"
             )
         bands.append((check_number(scale, "scales", low=0.25, high=20), pairs[0], pairs[1]))
     if not bands:
@@ -104,7 +104,7 @@ def window_search(
     return search_list
 
 
-def _scale(pair: tuple[int, int], image: NDArray[np.uint8]) -> tuple[int, int]:
+def _scale(pair: Sequence[int], image: NDArray[np.uint8]) -> tuple[int, int]:
     """Positions in an image of those in a 1280x720 frame."""
     factor = max(image.shape) / REFERENCE_WIDTH
     return round(pair[0] * factor), round(pair[1] * factor)

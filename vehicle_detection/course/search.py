@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Workspace, check_choice, choice, describe, integer, number
+from vehicle_detection._common import choice, describe, integer, number
 from vehicle_detection.course.features import (
     FeatureOptions,
     Image,
@@ -31,7 +31,7 @@ from vehicle_detection.course.features import (
     warn_of_first_bin,
 )
 from vehicle_detection.course.versions import FORMULAS, RETURNS, lesson_function, warn
-from vehicle_detection.course.windows import Corners, box_rows, corner_array, draw_boxes
+from vehicle_detection.course.windows import BLUE, THICKNESS, Corners, box_rows, corner_array
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE
 from vehicle_detection.search import BandFilters
@@ -235,7 +235,6 @@ def find_cars(
     >>> find_car_windows(image, 0, 96, 1, svc, scaler, 9, 8, 2, (32, 32), 32)
     [((0, 0), (64, 64)), ((0, 16), (64, 80)), ((16, 0), (80, 64)), ((16, 16), (80, 80))]
     """
-    check_choice(returns, "returns", RETURNS)
     options, image = _SearchOptions.of(locals()), check_lesson_image(img)
     top, bottom = options.rows(image.shape[0])
     image = scale_values(image[top:bottom], options.divide_by)
@@ -252,7 +251,10 @@ def find_cars(
         boxes.append(((x, y), (x + side, y + side)))
     if returns == "boxes":
         return boxes
-    return draw_boxes(img, boxes) if returns == "picture" else (draw_boxes(img, boxes), boxes)
+    drawn = np.array(img, order="C")
+    for corner, opposite in boxes:
+        cv2.rectangle(drawn, corner, opposite, BLUE, THICKNESS)
+    return drawn if returns == "picture" else (drawn, boxes)
 
 
 @functools.wraps(find_cars, assigned=())
@@ -273,6 +275,7 @@ class _SearchOptions(FeatureOptions):
     divide_by: float = number(above=0)
     resize: str = choice(MISSING, ("after conversion", "before conversion"))
     formula: str = choice(MISSING, FORMULAS)
+    returns: str = choice(MISSING, RETURNS)
 
     def rows(self, height: int) -> tuple[int, int]:
         """Rows of the band, clipped to the image's height."""
@@ -309,7 +312,7 @@ def _search_band(converted: Image, estimators: _Estimators, options: _SearchOpti
     if rows < 1 or columns < 1:
         return np.zeros((0, 0), np.bool_)
     if estimators.filters is not None:
-        scores = _fast_scores(converted, options, estimators.filters, estimators.workspace)
+        scores = _fast_scores(converted, options, estimators.filters)
         return np.asarray(scores[::cells_per_step, ::cells_per_step][:rows, :columns] > 0)
     hog = None
     if options.hog_feat:
@@ -334,9 +337,7 @@ def _search_band(converted: Image, estimators: _Estimators, options: _SearchOpti
     return np.concatenate(hits).reshape(rows, columns)
 
 
-def _fast_scores(
-    converted: Image, options: FeatureOptions, filters: BandFilters, workspace: Workspace
-) -> NDArray[np.float32]:
+def _fast_scores(converted: Image, options: FeatureOptions, filters: BandFilters) -> NDArray[np.float32]:
     """Scores of the windows at every cell by the library's filters."""
     hist, tables, limits = converted, filters.tables, options.hist_range
     if options.hist_feat and limits and not (converted.dtype == np.uint8 and options.has_library_range):
@@ -344,7 +345,7 @@ def _fast_scores(
         # The last bin, of values out of range, has no weight.
         tables = np.pad(filters.weights_by_bin, ((0, 0), (0, 0), (0, 1)))
     source = options.hog_source(converted) if options.hog_feat else None
-    return filters.score_images(source, converted, hist, tables, workspace)
+    return filters.score_images(source, converted, hist, tables)
 
 
 def _classify_patches(patches: list[Image], estimators: _Estimators) -> NDArray[np.bool_]:
@@ -365,7 +366,6 @@ class _Estimators:
     state: list[Any] | None  # what scikit-learn's classes compute with; None for other classes
     classifier: VehicleClassifier | None  # the same as the library's, if it is linear
     filters: BandFilters | None  # for the fast search, if windows can share the features
-    workspace: Workspace  # of the filters
     unit_range: bool | None  # whether the scaler was fitted on images with values 0-1; None if unknown
 
     def predict(self, features: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -443,7 +443,7 @@ def _read_estimators(clf: Any, scaler: Any, options: FeatureOptions, state: list
     if options.hist_feat and not options.hist_range:
         filters = None
     unit_range = _was_fitted_on_unit_range(scaler, options)
-    return _Estimators(clf, scaler, options, state, classifier, filters, Workspace(), unit_range)
+    return _Estimators(clf, scaler, options, state, classifier, filters, unit_range)
 
 
 def _warn_of_range(estimators: _Estimators, image: Image) -> None:

@@ -300,7 +300,7 @@ def plot_tradeoff(
 ) -> Axes:
     """Plot the quality of each configuration against its cost, with the Pareto front.
 
-    `table` holds results of `compare_configurations` or `search_parameters`. `quality` and `cost` are its
+    `table` holds results of `compare_configurations` or `compare_searches`. `quality` and `cost` are its
     columns of the y axis, where higher is better, and of the x axis, where lower is better; `label` is that
     of the text beside the points of the front. Rows without either value are left out. The first collection
     of the Axes holds all points, the first line the front (see `pareto_front`).

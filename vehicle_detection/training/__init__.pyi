@@ -45,9 +45,7 @@ from .searches import compare_searches as compare_searches
 from .trials import TrialOptions as TrialOptions
 from .trials import expand_grid as expand_grid
 from .trials import parse_grid as parse_grid
-from .tuning import Halving as Halving
 from .tuning import compare_configurations as compare_configurations
-from .tuning import search_parameters as search_parameters
 from .validation import FOLD_COLUMNS as FOLD_COLUMNS
 from .validation import FoldDetections as FoldDetections
 from .validation import FoldScore as FoldScore

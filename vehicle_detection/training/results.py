@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import csv
-import io
 import json
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,33 +14,22 @@ from numpy.typing import NDArray
 from vehicle_detection._common import (
     atomic_write,
     check_path,
-    check_target,
+    check_suffix,
     describe,
     import_pyarrow,
-    write_text,
 )
 from vehicle_detection.errors import DatasetError, InvalidInputError
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-# Text columns: a cell "0012" is not a number.
-_TEXT_COLUMNS = frozenset(
-    {"status", "message", "stage", "configuration", "color_space", "split", "frame_f1_by_set", "trial"}
-)
-
-_NUMBER_COLUMNS = ("C", "accuracy", "train_accuracy", "search_ms", "fit_seconds", "seed", "train_size")
-
-_CONSTANTS: dict[str, Any] = {"": None, "True": True, "False": False}
-
 
 def make_table(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> DataFrame:
-    """Build a table; None becomes NaN, and a column without any value is float64 unless it holds text."""
+    """Build a table; None becomes NaN, and a column without any value is float64."""
     import pandas as pd
 
     table = pd.DataFrame([dict(row) for row in rows], columns=columns)
-    empty = [name for name in table if name not in _TEXT_COLUMNS and table[name].isna().all()]
-    return table.astype(dict.fromkeys(empty, np.float64))
+    return table.astype({name: np.float64 for name in table if table[name].isna().all()})
 
 
 def check_column(table: DataFrame, name: object) -> None:
@@ -54,7 +39,7 @@ def check_column(table: DataFrame, name: object) -> None:
     if not isinstance(table, pd.DataFrame):
         raise InvalidInputError(
             f"table must be a pandas DataFrame, got {describe(table)}; "
-            "pass what compare_configurations, search_parameters or read_results returns"
+            "pass what compare_configurations or read_results returns"
         )
     if not isinstance(name, str) or name not in table.columns:
         listed = ", ".join(map(str, table.columns))
@@ -94,26 +79,27 @@ def pareto_front(table: DataFrame, quality: str = "accuracy", cost: str = "searc
 
 def write_results(table: DataFrame, path: str | os.PathLike[str]) -> None:
     """Write a table atomically as ``.csv``, ``.jsonl`` or ``.parquet`` (needs pyarrow)."""
-    suffix = _check_suffix(path, (".csv", ".jsonl", ".parquet"), "path")
+    suffix = check_suffix(path, "path", (".csv", ".jsonl", ".parquet")).suffix.lower()
     if suffix == ".parquet":
+        import_pyarrow()
         # A Parquet column has one type, but hog_channel is 0 or "ALL": write mixed columns as text.
         mixed = [name for name in table if table[name].dropna().map(type).nunique() > 1]
         table = table.assign(**{name: table[name].map(str, na_action="ignore") for name in mixed})
-        pyarrow = import_pyarrow()
-        with atomic_write(path, "path") as part:
-            pyarrow.parquet.write_table(pyarrow.table(table.reset_index(drop=True)), part)
-        return
-    lines = [_csv_line(table.columns)] if suffix == ".csv" else []
-    lines += [_format_row(row, table.columns, suffix) for row in table.to_dict("records")]
-    write_text(path, "".join(lines), "path")
+    with atomic_write(path, "path") as part:
+        if suffix == ".csv":
+            table.to_csv(part, index=False, lineterminator="\n")
+        elif suffix == ".parquet":
+            table.to_parquet(part, index=False)
+        else:
+            part.write_text("".join(map(_format_row, table.to_dict("records"))), encoding="utf-8")
 
 
 def read_results(path: str | os.PathLike[str]) -> DataFrame:
-    """Read the table of a finished or interrupted run: the ``store`` of a search, or a written table.
+    """Read the table of a finished or interrupted run: the ``store`` of a comparison, or a written table.
 
     Returns one row per line of the ``.csv`` or ``.jsonl`` file; see `compare_configurations` for the columns.
-    NaN marks a missing value. An incomplete last line is left out, and so is the second row of a trial that
-    two runs have measured at the same time; another damaged line raises a `DatasetError`.
+    NaN marks a missing value. An incomplete last line of ``.jsonl`` is left out, and so is the second row of
+    a trial that two runs have measured at the same time; another damaged line raises a `DatasetError`.
 
     >>> import tempfile
     >>> import pandas as pd
@@ -124,137 +110,83 @@ def read_results(path: str | os.PathLike[str]) -> DataFrame:
       configuration  accuracy
     0             a      0.98
     """
+    import pandas as pd
+
     file = check_path(path)
-    suffix = _check_suffix(path, (".csv", ".jsonl"), "path")
+    if file.suffix.lower() not in (".csv", ".jsonl"):
+        raise InvalidInputError(f"path must end in .csv or .jsonl; got {file.name!r}")
     if not file.is_file():
         raise DatasetError(f"results file {file} does not exist; check the path")
-    columns, rows = _parse(_complete_lines(file), file, suffix)
-    seen: dict[Any, dict[str, Any]] = {}
-    for number, row in enumerate(rows):
-        trial = row.get("trial")
-        seen.setdefault((trial, row.get("stage"), row.get("configuration")) if trial else number, row)
-    return make_table(seen.values(), columns)
+    if file.suffix.lower() == ".csv":
+        try:
+            return pd.read_csv(file, dtype={"trial": str})
+        except ValueError as error:  # also of the parser, and of bytes that are not UTF-8
+            raise DatasetError(f"results file {file} is not a table: {error}") from error
+    table = make_table(_read_lines(file)[1])
+    return table.drop_duplicates("trial", ignore_index=True) if "trial" in table else table
 
 
 class RowStore(dict[str, Mapping[str, Any]]):
     """Rows by their ``trial``; each new one is appended to a file and synced to disk at once.
 
-    `path` is a ``.csv`` or ``.jsonl`` file, read first if it exists; None keeps the rows in memory only.
+    `path` is a ``.jsonl`` file, read first if it exists; None keeps the rows in memory only.
     """
 
     def __init__(self, path: str | os.PathLike[str] | None, columns: Sequence[str]) -> None:
         super().__init__()
         self._columns = tuple(columns)
-        self._suffix = "" if path is None else _check_suffix(path, (".csv", ".jsonl"), "store")
-        self._path = None if path is None else check_target(path, "store")
+        self._path = None if path is None else check_suffix(path, "store", (".jsonl",))
         if self._path is None or not self._path.exists():
             return
-        text = _complete_lines(self._path)
-        header, rows = _parse(text, self._path, self._suffix)
-        start = (
-            _csv_line(self._columns) if self._suffix == ".csv" else json.dumps({self._columns[0]: ""})[:-3]
-        )
-        head = self._path.read_bytes()[: len(start)].removeprefix(b"\xef\xbb\xbf")
-        if not start.encode().startswith(head) or (header and tuple(header) != self._columns):
+        start = json.dumps({self._columns[0]: ""})[:-3].encode()
+        is_own = start.startswith(self._path.read_bytes()[: len(start)])
+        text, rows = _read_lines(self._path) if is_own else (b"", [])
+        if not is_own or any(tuple(row) != self._columns for row in rows):
             raise DatasetError(
                 f"store {self._path} is not a table of trials, or of another release; choose another file"
             )
         # Remove an incomplete last line: the next row would be appended to it.
-        os.truncate(self._path, len(text.encode("utf-8")))
-        self.update({str(row["trial"]): row for row in rows if row.get("trial")})
+        os.truncate(self._path, len(text))
+        self.update({str(row["trial"]): row for row in rows})
 
     def add(self, row: Mapping[str, Any]) -> None:
         """Store a finished row."""
         self[row["trial"]] = row
         if self._path is None:
             return
-        line = _format_row(row, self._columns, self._suffix)
         with self._path.open("a+b") as file:
             file.seek(0)
             # Another run may have measured it at the same time; `read_results` drops what it still writes.
             if str(row["trial"]).encode() in file.read():
                 return
-            if file.tell() == 0 and self._suffix == ".csv":
-                line = _csv_line(self._columns) + line
-            file.write(line.encode("utf-8"))
+            file.write(_format_row({name: row.get(name) for name in self._columns}).encode())
             file.flush()
             os.fsync(file.fileno())
 
 
-def _check_suffix(path: str | os.PathLike[str], allowed: tuple[str, ...], name: str) -> str:
-    suffix = check_path(path, name).suffix.lower()
-    if suffix not in allowed:
-        raise InvalidInputError(f"{name} must end in {' or '.join(allowed)}; got {Path(path).name!r}")
-    return suffix
+def _format_row(row: Mapping[Any, Any]) -> str:
+    """Format a row as a line of JSON, in which NaN is null."""
+    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
+    values = {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in plain.items()
+    }
+    return json.dumps(values, ensure_ascii=False) + "\n"
 
 
-def _csv_line(values: Iterable[Any]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow(values)
-    return text.getvalue()
-
-
-def _format_row(row: Mapping[str, Any], columns: Iterable[str], suffix: str) -> str:
-    """Format a row as one line of a file; NaN becomes None, and a line break in text a space."""
-    values: dict[str, Any] = {}
-    for name in columns:
-        value = row.get(name)
-        value = value.item() if isinstance(value, np.generic) else value
-        missing = isinstance(value, float) and not math.isfinite(value)
-        values[name] = " ".join(value.split()) if isinstance(value, str) else None if missing else value
-    if suffix == ".csv":
-        return _csv_line(values.values())
-    return json.dumps(values, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def _complete_lines(file: Path) -> str:
-    """Text of a file up to its last line break; a killed writer may have left an incomplete line."""
-    data = file.read_bytes()
-    try:
-        return data[: data.rfind(b"\n") + 1].decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise DatasetError(
-            f"results file {file} is not UTF-8 text ({error.reason}); check the path"
-        ) from error
-
-
-def _parse(text: str, file: Path, suffix: str) -> tuple[list[str], list[dict[str, Any]]]:
-    """Column names and rows of a file's text."""
-    rows: list[dict[str, Any]] = []
-    text = text.removeprefix("\ufeff")  # the mark that programs on Windows add
-    if suffix == ".jsonl":
-        for number, line in enumerate(text.splitlines(), start=1):
-            try:
-                row = json.loads(line)
-            except (ValueError, RecursionError):
-                row = None
-            if not isinstance(row, dict):
-                raise _damaged_line(file, number)
-            rows.append(row)
-        return list(dict.fromkeys(name for row in rows for name in row)), rows
-    header, *lines = csv.reader(io.StringIO(text)) if text else [[]]
-    for number, cells in enumerate(lines, start=2):
-        if len(cells) != len(header):
-            raise _damaged_line(file, number)
-        rows.append({name: _parse_cell(name, cell) for name, cell in zip(header, cells)})
-        if any(isinstance(rows[-1].get(name), str) for name in _NUMBER_COLUMNS):
-            raise _damaged_line(file, number)
-    return header, rows
-
-
-def _damaged_line(file: Path, number: int) -> DatasetError:
-    return DatasetError(f"results file {file} is damaged in line {number}; delete that line or the file")
-
-
-def _parse_cell(name: str, cell: str) -> Any:
-    if name in _TEXT_COLUMNS:
-        return cell or None
-    return _CONSTANTS[cell] if cell in _CONSTANTS else number_or_text(cell)
-
-
-def number_or_text(text: str) -> int | float | str:
-    """Parse a text as an integer, else as a float, else return it unchanged."""
-    for kind in (int, float):
-        with contextlib.suppress(ValueError):
-            return kind(text)
-    return text
+def _read_lines(file: os.PathLike[str]) -> tuple[bytes, list[dict[str, Any]]]:
+    """Bytes and rows of a file up to its last line break: a killed writer leaves an incomplete line."""
+    with open(file, "rb") as opened:
+        data = opened.read()
+    text, rows = data[: data.rfind(b"\n") + 1], []
+    for number, line in enumerate(text.splitlines(), start=1):
+        try:
+            row = json.loads(line)
+        except (ValueError, RecursionError):
+            row = None
+        if not isinstance(row, dict):
+            raise DatasetError(
+                f"results file {file} is damaged in line {number}; delete that line or the file"
+            )
+        rows.append(row)
+    return text, rows

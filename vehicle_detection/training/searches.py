@@ -32,12 +32,12 @@ def compare_searches(
     """Search labelled frames with all combinations of windows, overlap and heat threshold.
 
     Returns a table with a row for each combination, best F1 first: ``scales``, ``overlap``, ``threshold``,
-    ``f1``, ``recall``, ``precision``, ``mean_iou``, and ``ms``, the time of the search per frame.
+    ``f1``, ``recall``, ``precision``, ``mean_iou``, and ``search_ms``, the time of the search per frame.
 
     Parameters
     ----------
     classifier, frames
-        The trained model, and frames with their boxes.
+        The trained model, and frames with their boxes, whose own horizon is used if it is known.
     scales, overlaps, thresholds
         Sets of sides of windows divided by 64 pixels, in a frame whose longer side is 1280; overlaps of
         neighbors as a fraction; and the number of windows that a pixel must exceed.
@@ -65,41 +65,30 @@ def compare_searches(
         ]
         for each in check_sequence(scales, "scales", "sets of numbers")
     ]
-    limits = [
-        check_number(each, "thresholds", low=0)
-        for each in check_sequence(thresholds, "thresholds", "numbers")
-    ]
-    shares = [
-        check_number(each, "overlaps", low=0, high=0.99)
-        for each in check_sequence(overlaps, "overlaps", "numbers")
-    ]
+    steps = _check_numbers(overlaps, "overlaps", 0.99)
+    limits = _check_numbers(thresholds, "thresholds", 1e9)
     rows = []
-    for sides, overlap in itertools.product(sets, shares):
+    for sides, overlap in itertools.product(sets, steps):
         bands = [
             SearchBand(window=(PATCH_SIZE * side,) * 2, y=(0.0, 256.0), overlap=(overlap, overlap))
             for side in sides
         ]
-        params = SearchParams(bands=tuple(bands), horizon=horizon)
+        params = SearchParams(bands=tuple(bands), horizon=horizon).with_horizon(frames.horizon)
         with classifier.open_search() as search:
             start = time.perf_counter()
-            windows = {key: search.find_windows(image, params) for key, image in frames}
-            seconds = (time.perf_counter() - start) / max(1, len(windows))
-        shapes = {key: image.shape for key, image in frames}
+            windows = [(key, image.shape, search.find_windows(image, params)) for key, image in frames]
+            milliseconds = 1000 * (time.perf_counter() - start) / len(windows)
         for limit in limits:
             heat = HeatParams(weighting="count", threshold=limit, peak_fraction=0)
-            found = {key: bounding_boxes(shapes[key], each, params=heat) for key, each in windows.items()}
+            found = {key: bounding_boxes(shape, each, params=heat) for key, shape, each in windows}
             scores = evaluate_detections(TrackTable.from_detections(found), frames.labels, frames=frames.keys)
-            names = ("f1", "recall", "precision", "mean_iou")
-            values = {name: getattr(scores, name) for name in names}
-            rows.append(
-                {
-                    "scales": tuple(sides),
-                    "overlap": overlap,
-                    "threshold": limit,
-                    **values,
-                    "ms": 1000 * seconds,
-                }
-            )
+            row = {"scales": tuple(sides), "overlap": overlap, "threshold": limit}
+            row |= {name: getattr(scores, name) for name in ("f1", "recall", "precision", "mean_iou")}
+            rows.append(row | {"search_ms": milliseconds})
     if not rows:
         raise InvalidInputError("scales, overlaps and thresholds must hold a value each; got an empty list")
     return pd.DataFrame(rows).sort_values("f1", ascending=False, kind="stable", ignore_index=True)
+
+
+def _check_numbers(values: Sequence[float], name: str, high: float) -> list[float]:
+    return [check_number(each, name, low=0, high=high) for each in check_sequence(values, name, "numbers")]

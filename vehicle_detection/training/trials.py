@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_path, check_sequence, check_type, describe, is_listing
+from vehicle_detection._common import check_sequence, check_type, describe, is_listing
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.detector import Detector
 from vehicle_detection.errors import InvalidInputError
@@ -28,7 +28,7 @@ from vehicle_detection.svm import VehicleClassifier
 from vehicle_detection.tables import TrackTable
 from vehicle_detection.training.classifier import DEFAULT_C, TrainingOptions, check_labels, fit_features
 from vehicle_detection.training.feature_cache import FeatureCache, digest_of
-from vehicle_detection.training.results import RowStore, make_table, number_or_text
+from vehicle_detection.training.results import RowStore, make_table
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -40,7 +40,7 @@ _FIELDS = (*FEATURE_FIELDS, *TRAINING_FIELDS)
 _FRAME_METRICS = ("frame_f1", "frame_best_f1", "frame_average_precision", "frame_iou")
 
 COLUMNS = (
-    "status", "message", "stage", "configuration", *FEATURE_FIELDS, "n_features", *TRAINING_FIELDS, "split",
+    "status", "message", "configuration", *FEATURE_FIELDS, "n_features", *TRAINING_FIELDS, "split",
     "seed", "train_size", "test_size", "train_accuracy", "accuracy", *_FRAME_METRICS, "frame_f1_by_set",
     "search_ms", "fit_seconds", "trial",
 )  # fmt: skip
@@ -163,11 +163,18 @@ def parse_grid(text: str) -> dict[str, list[Any]]:
             )
         if name in grid:
             raise InvalidInputError(f"grid names {name} twice; put all its values into one list")
-        grid[name] = [_BOOLEANS.get(each.lower(), number_or_text(each)) for each in values.split(",")]
+        grid[name] = [_BOOLEANS.get(each.lower(), _number_or_text(each)) for each in values.split(",")]
     if not grid:
         raise InvalidInputError("grid is empty; name at least one option, such as 'orient=8,9'")
-    _check_names(grid, "grid")
     return grid
+
+
+def _number_or_text(text: str) -> int | float | str:
+    """Parse a text as an integer, else as a float, else return it unchanged."""
+    for kind in (int, float):
+        with contextlib.suppress(ValueError):
+            return kind(text)
+    return text
 
 
 def _check_names(options: Mapping[str, Any], name: str) -> None:
@@ -203,13 +210,12 @@ class TrialOptions:
     region_params: RegionParams = dataclasses.field(default_factory=RegionParams)
     #: Measure the time of the fast search of a 1280x720 frame with `search_params` on one core.
     time_search: bool = True
-    #: Folder that keeps features between runs, or a `FeatureCache` of the same patches.
-    cache: FeatureCache | str | os.PathLike[str] | None = None
+    #: Features of the same patches that several comparisons share; None: each computes its own.
+    cache: FeatureCache | None = None
     jobs: int | None = None  #: threads of the feature extraction
 
     def __post_init__(self) -> None:
-        if self.cache is not None and not isinstance(self.cache, FeatureCache):
-            check_path(self.cache, "cache", kind="a folder")
+        check_type(self.cache, "cache", FeatureCache | None, "pass FeatureCache(patch_set.patches)")
         for each in self.frame_sets:
             if not isinstance(each, LabelledFrames):
                 raise InvalidInputError(f"frames must be LabelledFrames, one or more; got {describe(each)}")
@@ -235,8 +241,8 @@ class Trials:
         check_type(options, "options", TrialOptions, "omit it for the defaults")
         check_type(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
         cache = options.cache
-        if not isinstance(cache, FeatureCache):
-            cache = FeatureCache(patch_set.patches, folder=cache, jobs=options.jobs)
+        if cache is None:
+            cache = FeatureCache(patch_set.patches, jobs=options.jobs)
         elif cache.patches is not patch_set.patches:
             raise InvalidInputError(
                 "cache must be a FeatureCache of the patches of patch_set; make one from patch_set.patches"
@@ -260,26 +266,22 @@ class Trials:
         """Rows so far."""
         return make_table(self._rows, COLUMNS)
 
-    def run(
-        self, candidate: Candidate, split: Split, seed: int, *, split_name: str, stage: str
-    ) -> Mapping[str, Any]:
-        """Return the row of a trial, from the store or measured now; ``"halving"`` does not search frames."""
-        on_frames = stage != "halving"
+    def run(self, candidate: Candidate, split: Split, seed: int, *, split_name: str) -> None:
+        """Add the row of a trial, from the store or measured now."""
         # Of the frames only the labels count, not the pixels; nor do the version and the machine.
-        options = self._options_digest if on_frames else None
-        trial = digest_of(self._patches_digest, candidate.columns, split.train, split.test, seed, options)
-        labels = {"stage": stage, "configuration": candidate.name, "split": split_name, "seed": seed}
-        row = self._store.get(trial) or self.measure(candidate, split, seed, on_frames) | candidate.columns
-        return self._add({**row, **labels, "trial": trial})
+        parts = split.train, split.test, seed, self._options_digest
+        trial = digest_of(self._patches_digest, candidate.columns, *parts)
+        labels = {"configuration": candidate.name, "split": split_name, "seed": seed}
+        row = self._store.get(trial) or self.measure(candidate, split, seed) | candidate.columns
+        self._add({**row, **labels, "trial": trial})
 
-    def add_impossible(self, candidate: Candidate, *, stage: str) -> None:
+    def add_impossible(self, candidate: Candidate) -> None:
         """Record an impossible combination."""
-        labels = {"stage": stage, "configuration": candidate.name}
         trial = digest_of(candidate.columns, candidate.error)
         error = {"status": "failed", "message": candidate.error}
-        self._add({**candidate.columns, **labels, **error, "trial": trial})
+        self._add({**candidate.columns, "configuration": candidate.name, **error, "trial": trial})
 
-    def _add(self, cells: Mapping[str, Any]) -> dict[str, Any]:
+    def _add(self, cells: Mapping[str, Any]) -> None:
         row = {name: cells.get(name) for name in COLUMNS}
         self._rows.append(row)
         self.bar.update()
@@ -288,9 +290,8 @@ class Trials:
             level = logging.WARNING if row["accuracy"] is None else logging.INFO
             outcome = row["message"] or row["accuracy"]
             _LOGGER.log(level, "%s, C=%s: %s: %s", row["configuration"], row["C"], row["status"], outcome)
-        return row
 
-    def measure(self, candidate: Candidate, split: Split, seed: int, on_frames: bool) -> dict[str, Any]:
+    def measure(self, candidate: Candidate, split: Split, seed: int) -> dict[str, Any]:
         """Train and measure; the columns that a measurement fills."""
         options, row = self._options, {"train_size": len(split.train), "test_size": len(split.test)}
         start = time.perf_counter()
@@ -302,7 +303,7 @@ class Trials:
         for name, rows in (("train_accuracy", split.train), ("accuracy", split.test)):
             features = self.cache.rows(classifier.params, rows)
             measured[name] = classifier.score(features, self.labels[rows])
-        if on_frames and (options.frame_sets or options.time_search):
+        if options.frame_sets or options.time_search:
             try:
                 classifier.open_search(jobs=1).close()
             except InvalidInputError as error:
