@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from benchmarks._material import Context, classifier_for_search, searched_frame
 from benchmarks._report import Row
 from benchmarks._timing import median_of, median_seconds, seconds_of
-from vehicle_detection import SearchParams, VehicleClassifier, _kernels, load_classifier, search
+from vehicle_detection import SearchParams, VehicleClassifier, load_classifier, search
 from vehicle_detection._common import available_cores
 from vehicle_detection.search import SearchBand
 

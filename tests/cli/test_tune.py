@@ -69,15 +69,30 @@ def test_a_search_is_varied_on_labelled_frames(material, tmp_path):
     assert plot.exists()
 
 
+@pytest.mark.parametrize("split", ["sequences", "random"])
+def test_halving_measures_its_finalists(patches, tmp_path, split):
+    out = tmp_path / "table.jsonl"
+    grid = f"orient=0,3,4 C=1e-9,1e-2 {SMALL}"
+    result = run(*patches, "--grid", grid, "-o", out, "--halving", "--finalists", 2, "--split", split)
+    assert result.exit_code == 0, result.output
+    table = read_results(out)
+    assert list(table["split"]) == [split] * 2
+    assert set(table["C"]) == {1e-2}
+
+
 def test_frames_are_scored(patches, material, tmp_path):
     out = tmp_path / "table.parquet"
     words = ["--frames", material / "road", "--labels", material / "road.csv"]
+    words += ["--cache", tmp_path / "features"]
     result = run(*patches, "--grid", f"orient=3 {SMALL}", "-o", out, *words)
     assert result.exit_code == 0, result.output
     assert re.search(r"frames F1 +best F1", result.stdout)
     assert out.exists()
     (row,) = read_results(tmp_path / "table.jsonl").to_dict("records")
     assert row["frame_f1_by_set"].startswith("road ")
+    (file,) = (tmp_path / "features").glob("*.npy")
+    file.write_bytes(file.read_bytes()[:200])  # damaged: computed again
+    assert run(*patches, "--grid", f"orient=3 C=1 {SMALL}", "-o", out, *words).exit_code == 0
 
 
 def test_an_interrupt_keeps_the_measured_rows(patches, tmp_path, monkeypatch):
@@ -103,6 +118,7 @@ def test_tune_refuses_bad_input(patches, material, tmp_path, monkeypatch):
     cases = {
         "{patches} -o t.csv --grid color=LAB": "--grid has the unknown option 'color'",
         "{patches} -o t.csv --grid orient": "--grid must look like 'orient=8,9",
+        "{patches} {grid} -o t.csv --halving --finalists 0": "--finalists must be an integer at least 1",
         "{grid} -o t.csv": "--grid of features needs patches to train on; give --vehicles and",
         "--grid scales=1 -o t.csv": "--grid of a search needs labelled frames",
         "--grid scales=a+b -o t.csv {frames}": "--grid must join scales by +",

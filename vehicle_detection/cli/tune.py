@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import vehicle_detection as vd
-from vehicle_detection.cli.options import PATCHES, option
+from vehicle_detection.cli.options import PATCHES, flag, option
 from vehicle_detection.cli.output import (
     check_targets,
     option_names,
@@ -55,14 +55,18 @@ def tune(
     model: str = option("highway", "FILE", "Model whose search is varied."),
     plot: Path | None = option(None, "FILE.png", "Accuracy against search time."),
     split: str = option("sequences", "sequences|groups|random", "Held-out patches."),
+    halving: bool = flag("--halving", "Eliminate poor configurations on few patches (successive halving)."),
+    finalists: int = option(3, "N", "Configurations to measure fully after --halving."),
     frames: Path | None = option(None, "DIR", "Labelled frames to score models on, such as test_images."),
     labels: Path | None = option(None, "FILE.csv", "True boxes of --frames."),
     horizon: float | None = option(None, "F", "Horizon of --frames, 0 (top) to 1, such as 0.55."),
     seed: int = option(0, "N", "Random seed of splits and training."),
+    cache: Path | None = option(None, "DIR", "Folder to keep features in, such as cache."),
 ) -> None:
     """Measure every combination of a grid of parameters, of training or of the search, and show the best."""
-    from vehicle_detection._common import check_choice, check_suffix
+    from vehicle_detection._common import check_choice, check_integer, check_suffix
 
+    check_integer(finalists, "--finalists", low=1)
     values = vd.training.parse_grid(grid)
     check_choice(split, "--split", ("sequences", "groups", "random"))
     sources = {"--vehicles": vehicles, "--non-vehicles": non_vehicles, "--labels": labels}
@@ -81,8 +85,9 @@ def tune(
         if vehicles is None or non_vehicles is None:
             raise InvalidInputError(f"--grid of features needs patches to train on; give {PATCHES}")
         options = {"splits": split, "seeds": (seed,), "store": output.with_suffix(".jsonl")}
-        options["options"] = vd.training.TrialOptions(frames=labelled)
-        table, look = _compare_models((vehicles, non_vehicles), values, options), {}
+        options["options"] = vd.training.TrialOptions(frames=labelled, cache=cache)
+        count = finalists if halving else None
+        table, look = _compare_models((vehicles, non_vehicles), values, options, count), {}
     if output.suffix.lower() != ".jsonl" or set(values) <= set(_SEARCH):
         vd.training.write_results(table, output)
     if plot is not None:
@@ -117,15 +122,23 @@ def _compare_searches(
 
 
 def _compare_models(
-    sources: tuple[Path, Path], values: Mapping[str, Sequence[Any]], options: dict[str, Any]
+    sources: tuple[Path, Path],
+    values: Mapping[str, Sequence[Any]],
+    options: dict[str, Any],
+    finalists: int | None,
 ) -> DataFrame:
-    """Train and measure models, and show the best."""
+    """Train and measure models, or those `finalists` that halving leaves, and show the best."""
     store = options["store"]
     is_new = not store.exists()
 
     def work() -> DataFrame:
         patches = vd.load_training_patches(*sources, progress=sys.stderr.isatty())
         configurations = vd.training.expand_grid(values)
+        if finalists is not None:
+            measured, seed = options["options"], options["seeds"][0]
+            halved = {"split": options["splits"], "random_state": seed, "options": measured}
+            found = vd.training.halve_configurations(patches, configurations, finalists, **halved)
+            configurations = found or configurations  # all are impossible, which their rows say
         return vd.training.compare_configurations(patches, configurations, progress=True, **options)
 
     table = run_interruptible(work)

@@ -46,6 +46,7 @@ from .trials import TrialOptions as TrialOptions
 from .trials import expand_grid as expand_grid
 from .trials import parse_grid as parse_grid
 from .tuning import compare_configurations as compare_configurations
+from .tuning import halve_configurations as halve_configurations
 from .validation import FOLD_COLUMNS as FOLD_COLUMNS
 from .validation import FoldDetections as FoldDetections
 from .validation import FoldScore as FoldScore

@@ -70,6 +70,11 @@ class Candidate:
     training: TrainingOptions | None = None
     error: str | None = None
 
+    @property
+    def options(self) -> dict[str, Any]:
+        """The configuration as a mapping."""
+        return {name: value for name, value in self.columns.items() if name != "n_features"}
+
 
 def read_configurations(
     configurations: Mapping[str, Configuration] | Sequence[Configuration], C: Sequence[float] = (DEFAULT_C,)
@@ -210,12 +215,11 @@ class TrialOptions:
     region_params: RegionParams = dataclasses.field(default_factory=RegionParams)
     #: Measure the time of the fast search of a 1280x720 frame with `search_params` on one core.
     time_search: bool = True
-    #: Features of the same patches that several comparisons share; None: each computes its own.
-    cache: FeatureCache | None = None
+    #: Folder that keeps features between runs, or a `FeatureCache` of the same patches.
+    cache: FeatureCache | str | os.PathLike[str] | None = None
     jobs: int | None = None  #: threads of the feature extraction
 
     def __post_init__(self) -> None:
-        check_type(self.cache, "cache", FeatureCache | None, "pass FeatureCache(patch_set.patches)")
         for each in self.frame_sets:
             if not isinstance(each, LabelledFrames):
                 raise InvalidInputError(f"frames must be LabelledFrames, one or more; got {describe(each)}")
@@ -241,8 +245,8 @@ class Trials:
         check_type(options, "options", TrialOptions, "omit it for the defaults")
         check_type(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
         cache = options.cache
-        if cache is None:
-            cache = FeatureCache(patch_set.patches, jobs=options.jobs)
+        if not isinstance(cache, FeatureCache):
+            cache = FeatureCache(patch_set.patches, folder=cache, jobs=options.jobs)
         elif cache.patches is not patch_set.patches:
             raise InvalidInputError(
                 "cache must be a FeatureCache of the patches of patch_set; make one from patch_set.patches"

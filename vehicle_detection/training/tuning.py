@@ -6,9 +6,13 @@ interrupted run continues where it stopped, and a run with more configurations m
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from vehicle_detection._common import (
     check_choice,
@@ -33,6 +37,9 @@ from vehicle_detection.training.trials import (
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+# Patches in the first round of successive halving: with fewer, scores are too noisy to rank candidates.
+_MIN_PATCHES = 300
 
 
 def compare_configurations(
@@ -111,6 +118,58 @@ def compare_configurations(
             for name, seed, split in parts:
                 trials.run(candidate, split, seed, split_name=name)
     return trials.table()
+
+
+def halve_configurations(
+    patch_set: PatchSet,
+    configurations: Sequence[Configuration],
+    count: int,
+    *,
+    split: str = "sequences",
+    random_state: int = 0,
+    options: TrialOptions | None = None,
+) -> list[dict[str, Any]]:
+    """Select the `count` best configurations by successive halving, best first.
+
+    All are ranked on few patches of a split, the best third continues with three times as many, and so on
+    (scikit-learn's ``HalvingGridSearchCV``). Impossible ones are left out.
+    """
+    from sklearn.base import BaseEstimator, ClassifierMixin
+    from sklearn.experimental import enable_halving_search_cv  # noqa: F401 - enables the next import
+    from sklearn.model_selection import HalvingGridSearchCV
+
+    trials = Trials(patch_set, options, RowStore(None, COLUMNS))
+
+    class Trial(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+        """An estimator over row numbers."""
+
+        def __init__(self, candidate: Any = None) -> None:
+            self.candidate = candidate
+
+        def fit(self, X: NDArray[np.intp], y: NDArray[np.int64]) -> Trial:
+            self.classes_, self.model_ = np.unique(y), trials.train(self.candidate, X[:, 0], random_state)
+            return self
+
+        def score(self, X: NDArray[np.intp], y: NDArray[np.int64]) -> float:
+            return self.model_.score(trials.cache.rows(self.model_.params, X[:, 0]), y)
+
+    possible = [each for each in dict.fromkeys(read_configurations(configurations)) if not each.error]
+    if len(possible) <= count:
+        return [each.options for each in possible]
+    n_patches, n_rounds = len(patch_set), int(math.log(len(possible), 3) + 1e-9)
+    search = HalvingGridSearchCV(
+        Trial(),
+        {"candidate": possible},  # one parameter that holds whole configurations
+        cv=[tuple(make_split(patch_set, split, random_state=random_state))],
+        min_resources=min(n_patches, max(n_patches // 3**n_rounds, _MIN_PATCHES)),
+        error_score="raise",
+        refit=False,
+        random_state=random_state,
+    )
+    results = search.fit(np.arange(n_patches)[:, None], trials.labels).cv_results_
+    order = np.lexsort((-results["mean_test_score"], -results["iter"]))
+    best = dict.fromkeys(results["params"][row]["candidate"] for row in order)
+    return [each.options for each in best][:count]
 
 
 def make_splits(
