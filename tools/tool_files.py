@@ -22,6 +22,7 @@ from vehicle_detection.errors import VehicleDetectionError
 
 CLASSES = ("person", "car", "truck", "bus")
 SHAPE = (540, 960)
+CORNERS = ("x1", "y1", "x2", "y2")
 
 
 @dataclass(frozen=True)
@@ -269,8 +270,7 @@ def table(folder: Path, truth: Sequence[Box], rng: random.Random) -> Written:
     columns: dict[str, Callable[[Box], object]] = {
         "frame": lambda box: box.image,
         rng.choice(("track", "track_id")): lambda box: box.track,
-        **{f"{axis}{end}": partial(lambda box, at: box.corners[at], at=at)
-           for at, (axis, end) in enumerate(("x1", "y1", "x2", "y2"))},
+        **{name: partial(lambda box, at: box.corners[at], at=at) for at, name in enumerate(CORNERS)},
         **({"score": lambda box: box.score} if scored else {"occluded": lambda box: box.occluded}),
         rng.choice(("class", "label", "category")): lambda box: box.label,
         "note": lambda box: "",
@@ -326,7 +326,7 @@ def _refused(folder: Path, truth: Sequence[Box], rng: random.Random) -> tuple[st
     return word, path.parent if "/" in name and rng.random() < 0.5 else path
 
 
-def damage_line(text: str, rng: random.Random, first: int) -> str | None:
+def damage_line(text: str, rng: random.Random, first: int) -> str:
     """Damage one line of a text as interrupted copies, editors and spreadsheets do."""
     lines = text.splitlines()
     at = rng.randrange(first, len(lines))
