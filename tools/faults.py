@@ -2,8 +2,8 @@
 
 ``python -m tools.faults --trials 500`` writes videos and results of batches in child processes that are
 killed, whose disk is full, whose ffmpeg is another program, or whose results folder holds links and pipes of
-somebody else. Afterwards, a video is the old one or a complete new one, records and their outputs are complete,
-and files outside are as they were.
+somebody else. Afterwards, a video is the old one or a complete new one, records and their outputs are whole,
+and files outside are as they were. The source of the library must not change during a run.
 """
 
 from __future__ import annotations
@@ -67,6 +67,7 @@ class Place:
         )
         self.victims = {path: path.read_bytes() for path in (folder / "victim", self.source, self.model)}
         self.old = self.target.read_bytes()
+        self.obstructed: Path | None = None  # a place that somebody else has changed
 
     def write_video(self) -> None:
         """Write a video over the earlier one."""
@@ -92,6 +93,8 @@ class Place:
                 found += [] if isinstance(values, dict) else [f"{record.name} is incomplete"]
                 for path in (values or {}).get("outputs", {}).values():
                     file = self.results / path
+                    if self.obstructed is not None and self.obstructed in (file, record, *file.parents):
+                        continue
                     whole = file.is_file() and (file.suffix != ".mp4" or _count(file) == FRAMES)
                     found += (
                         [] if whole else [f"{path} is missing or incomplete, but its record says it is done"]
@@ -147,15 +150,15 @@ def _obstruct(place: Place, rng: random.Random) -> str:
         rng.choice(files),
         rng.choice(("link", "hard link", "pipe", "folder link", "text", "outputs")),
     )
-    victim = place.folder / "victim"
+    victim, place.obstructed = place.folder / "victim", path
     if kind == "outputs":
-        record = next((place.results / "records").glob("*.json"))
+        record = place.obstructed = next((place.results / "records").glob("*.json"))
         wrong = rng.choice(("../victim", str(victim), "tracks/../../victim", "tracks/\0", ""))
         record.write_text(json.dumps(json.loads(record.read_text()) | {"outputs": {"tracks": wrong}}))
         place.source.touch()
         return f"outputs {wrong!r}"
     if kind == "folder link":
-        path = path.parent
+        path = place.obstructed = path.parent
         shutil.rmtree(path)
         path.symlink_to(place.folder, target_is_directory=True)
         return f"link {path.name}"
