@@ -359,7 +359,7 @@ def test_frames_without_times_and_frame_rate_warn_once_of_their_speeds(method):
         follow(unknown, [None] * 12)
 
 
-def test_the_documented_code_for_own_frames_and_images(capsys):
+def test_the_documented_code_for_own_frames(capsys):
     page = (ROOT / "docs" / "sources.md").read_text()
     sections = dict(section.split("\n", 1) for section in page.split("\n## ")[1:])
     blocks = {
@@ -370,15 +370,6 @@ def test_the_documented_code_for_own_frames_and_images(capsys):
     exec(blocks["Frames of your own"], names)
     assert names["picture"].shape == (360, 640, 3)
     assert len(capsys.readouterr().out.splitlines()) == 3
-    exec(blocks["Images in a web service"], names)
-    data = (ROOT / "test_images" / "road1.jpg").read_bytes()
-    with ThreadPoolExecutor(2) as executor:
-        first, second = executor.map(names["find_vehicles"], [data, data])
-    assert first == second
-    assert first
-    assert set(first[0]) == {"box", "confidence"}
-    with pytest.raises(InvalidInputError, match="the bytes must be a complete image"):
-        names["find_vehicles"](data[:50])
 
 
 def test_only_single_images_are_read_from_files():
