@@ -177,7 +177,7 @@ class Detections:
             labels = [str(names[int(each)]) for each in check_array(classes, "classes")]
         known = confidence if scale == "probability" else None
         found = cls(boxes, scores, known, labels, None if classes is None else check_array(classes, "cls"))
-        return found if class_ids is None else select_classes(found, classes, check_class_ids(class_ids))
+        return found if class_ids is None else select_classes(found, check_class_ids(class_ids))
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return a table with a row for each box: corners, score and, if known, confidence and class.
@@ -284,17 +284,16 @@ def check_class_ids(class_ids: object) -> tuple[int, ...]:
     return tuple(check_integer(each, "class_ids", low=0) for each in ids)
 
 
-def select_classes(found: Detections, classes: Any, class_ids: Collection[int]) -> Detections:
-    """Keep the boxes of these classes; `classes` is ``(N,)``, or None if they are unknown."""
+def select_classes(found: Detections, class_ids: Collection[int]) -> Detections:
+    """Keep the boxes of these classes."""
+    if found.class_ids is not None:
+        return found[np.isin(found.class_ids, list(class_ids))]
     if not len(found):
         return found
-    column = check_array(classes, "classes")
-    if column.shape != (len(found),) or column.dtype.kind not in "iuf":
-        raise InvalidInputError(
-            f"class_ids needs an integer class for each of {pluralize(len(found), 'box', 'es')}, got "
-            f"{describe(classes)}; omit it, or return (boxes, scores, classes)"
-        )
-    return found[np.isin(column, list(class_ids))]
+    raise InvalidInputError(
+        f"class_ids needs an integer class for each of {pluralize(len(found), 'box', 'es')}, got None; omit "
+        "it, or return (boxes, scores, classes)"
+    )
 
 
 def box_areas(boxes: NDArray[Any]) -> Floats:

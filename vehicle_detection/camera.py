@@ -387,7 +387,7 @@ def open_camera(
     if isinstance(fov, (int, float)) and _MAX_PINHOLE_FOV < fov <= 170:
         advice = "state that along the longer side, or choose a fisheye lens"
         _LOGGER.warning("a field of view of %g degrees may be that along the diagonal; %s", fov, advice)
-    if isinstance(height_m, (int, float)) and not _HEIGHTS[0] <= height_m <= _HEIGHTS[1]:
+    if isinstance(height_m, (int, float)) and (0 < height_m < _HEIGHTS[0] or _HEIGHTS[1] < height_m <= 100):
         _LOGGER.warning("a camera height of %g m is unusual; distances are proportional to it", height_m)
     for name, value, allowed in (
         ("fov", fov, camera is None),

@@ -163,7 +163,7 @@ class FunctionModel:
             scores = log_odds(returned[1], self.score, self.threshold)
             found = Detections(returned[0], scores, labels=labels, class_ids=classes)
             if self.class_ids is not None:
-                found = select_classes(found, classes, self.class_ids)
+                found = select_classes(found, self.class_ids)
         else:
             raise InvalidInputError(
                 f"expected (boxes, scores) or (boxes, scores, classes), got {describe(returned)}; for an "

@@ -243,7 +243,7 @@ BAD_VIDEOS = {
     "{clip} -o out.mp4 --blur faces": "--blur must be one of 'vehicles', 'plates'; got 'faces'",
     "{clip} -o out.mp4 --events e.txt": "--events must end in .csv or .json, got 'e.txt'",
     "{clip} -o out.mp4 --own-speed -1": "--own-speed must be a speed of at most 500",
-    "{clip} -o out.mp4 --srt s.txt": "--srt must end in .srt, got 's.txt'",
+    "{clip} -o out.mp4 --srt s.txt": "--srt must end in .srt or .ass, got 's.txt'",
     "{clip} -o out.mp4 --gpx {clip}": "--gpx must end in .gpx or .nmea or .csv, got 'clip.mp4'",
     "{clip} -o out.mp4 --gpx none.gpx": "--gpx none.gpx does not exist",
     "{clip} -o out.mp4 --own-speed 9 --gpx a.gpx": "--own-speed and --gpx both .* give one of them",
