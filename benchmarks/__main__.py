@@ -19,6 +19,7 @@ from benchmarks import (
     _features,
     _frames,
     _lenses,
+    _limits,
     _memory,
     _peers,
     _scaling,
@@ -34,6 +35,7 @@ from benchmarks._report import Row, print_table, write_json
 BENCHMARKS: dict[str, Callable[[Context], list[Row]]] = {
     "search": _search.run,
     "video": _video.run,
+    "limits": _limits.run,
     "memory": _memory.run,
     "features": _features.run,
     "startup": _startup.run,

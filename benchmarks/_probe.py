@@ -1,8 +1,9 @@
 """Measurements in a process of their own, which print one line of JSON.
 
-``python -m benchmarks._probe startup FRAME.npy [--kernels]``, ``... memory VIDEO TARGET``,
-``... each videos|tracks FOLDER OUTPUT``, ``... bound CPU videos|tracks OUTPUT VIDEO...`` and
-``... trips FOLDER OUTPUT``. Only the standard library is imported before the measurement starts.
+``python -m benchmarks._probe startup FRAME.npy [--kernels] [--highway]``, ``... memory VIDEO TARGET``,
+``... latency`` of standard input, ``... each videos|tracks FOLDER OUTPUT``,
+``... bound CPU videos|tracks OUTPUT VIDEO...`` and ``... trips FOLDER OUTPUT``. Only the standard library is
+imported before the measurement starts.
 """
 
 from __future__ import annotations
@@ -18,11 +19,17 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def run_probe(*arguments: str, **environment: str) -> dict[str, Any]:
+def run_probe(*arguments: str, stdin: Any = None, **environment: str) -> dict[str, Any]:
     """Run this module in a new interpreter and return its result."""
     command = [sys.executable, "-m", "benchmarks._probe", *arguments]
     done = subprocess.run(
-        command, cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True, check=False
+        command,
+        cwd=ROOT,
+        env={**os.environ, **environment},
+        stdin=stdin,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode:
         raise RuntimeError(f"the measurement failed:\n{done.stderr}")
@@ -30,7 +37,7 @@ def run_probe(*arguments: str, **environment: str) -> dict[str, Any]:
     return found
 
 
-def startup(frame: str, *, kernels: bool = False) -> dict[str, Any]:
+def startup(frame: str, *, kernels: bool = False, model: str = "default") -> dict[str, Any]:
     """Import the package and detect on a first frame."""
     began = time.perf_counter()
     import vehicle_detection
@@ -44,7 +51,7 @@ def startup(frame: str, *, kernels: bool = False) -> dict[str, Any]:
 
         recorder = event.install_recorder("numba:compile")
         record = recorder.__enter__()
-    vehicle_detection.VehicleDetector().detect(np.load(frame))
+    vehicle_detection.VehicleDetector(model).detect(np.load(frame))
     first = time.perf_counter()
     return {
         "import": imported - began,
@@ -81,8 +88,34 @@ def memory(source: str, target: str) -> dict[str, Any]:
             sampled.append(current_memory())
 
     with vehicle_detection.VehicleDetector() as detector:
-        vehicle_detection.process_video(source, target, detector, progress=False, on_result=note)
+        vehicle_detection.process_video(source, target or None, detector, progress=False, on_result=note)
     return {"frames": len(times), "peak": peak_memory(), "memory": sampled, "times": times}
+
+
+def latency() -> dict[str, Any]:
+    """Track standard input as a live source; seconds from the arrival of each frame to its result."""
+    import numpy as np
+
+    import vehicle_detection
+    from vehicle_detection.video.live import LiveStream
+
+    arrivals: dict[int, float] = {}
+    read = LiveStream.read
+
+    def note(stream: LiveStream, planes: Any) -> int | None:
+        number = read(stream, planes)
+        if number is not None:
+            arrivals[number] = time.perf_counter()
+        return number
+
+    LiveStream.read = note  # type: ignore[method-assign]
+    found: list[float] = []
+    with vehicle_detection.VehicleDetector() as detector:
+        detector.detect(np.zeros((720, 1280, 3), np.uint8))  # opens the session
+        with vehicle_detection.open_source("-", live=True) as source:
+            results = vehicle_detection.track(source, detector)
+            found.extend(time.perf_counter() - arrivals[result.index] for result in results)
+    return {"latencies": found, "dropped": results.report().dropped}
 
 
 def each(kind: str, folder: str, out: str) -> dict[str, Any]:
@@ -158,9 +191,12 @@ def main(arguments: list[str]) -> None:
     """Run the named measurement."""
     kind, *rest = arguments
     if kind == "startup":
-        found = startup(rest[0], kernels="--kernels" in rest)
+        model = "highway" if "--highway" in rest else "default"
+        found = startup(rest[0], kernels="--kernels" in rest, model=model)
     else:
-        found = {"memory": memory, "each": each, "bound": bound, "trips": trips}[kind](*rest)
+        found = {"memory": memory, "latency": latency, "each": each, "bound": bound, "trips": trips}[kind](
+            *rest
+        )
     print(json.dumps(found))
 
 
