@@ -53,7 +53,8 @@ def page(outcomes: Outcomes) -> str:
 Each argument of each public function, constructor and method, and each option of the commands, was given
 one bad value of each kind, while the others were valid. Of {refused + accepted:,} calls, {refused:,} ended
 with an error of `vehicle_detection.errors`, or exit code 2 of a command; the value was valid in the other
-{accepted:,}. No call raised another error, took longer than {MAX_SECONDS} s, or left a file after an error.
+{accepted:,}. No call raised another error, took longer than {MAX_SECONDS} s, or left a file after an error,
+but for `tune --cache`, whose files save time the next time.
 The text of an error names the argument, what was expected, what came and what to do.
 
 `python -m tools.bad_input_page` makes these calls and writes this page. `tests/tools/test_bad_input.py` makes

@@ -119,6 +119,7 @@ def test_tune_refuses_bad_input(patches, material, tmp_path, monkeypatch):
         "{patches} -o t.csv --grid color=LAB": "--grid has the unknown option 'color'",
         "{patches} -o t.csv --grid orient": "--grid must look like 'orient=8,9",
         "{patches} {grid} -o t.csv --halving --finalists 0": "--finalists must be an integer at least 1",
+        "{patches} {grid} -o t.csv --model highway": "--model needs a --grid of a search",
         "{grid} -o t.csv": "--grid of features needs patches to train on; give --vehicles and",
         "--grid scales=1 -o t.csv": "--grid of a search needs labelled frames",
         "--grid scales=a+b -o t.csv {frames}": "--grid must join scales by +",

@@ -52,7 +52,7 @@ def tune(
     ),
     vehicles: Path | None = option(None, "PATH", "Folder or zip of patches of vehicles to train on."),
     non_vehicles: Path | None = option(None, "PATH", "Folder or zip of other patches."),
-    model: str = option("highway", "FILE", "Model whose search is varied."),
+    model: str | None = option(None, "FILE", "Model whose search is varied; default: highway."),
     plot: Path | None = option(None, "FILE.png", "Accuracy against search time."),
     split: str = option("sequences", "sequences|groups|random", "Held-out patches."),
     halving: bool = flag("--halving", "Eliminate poor configurations on few patches (successive halving)."),
@@ -79,9 +79,11 @@ def tune(
     if set(values) <= set(_SEARCH):
         if labelled is None:
             raise InvalidInputError("--grid of a search needs labelled frames; give --frames and --labels")
-        table = run_interruptible(lambda: _compare_searches(model, labelled, values))
+        table = run_interruptible(lambda: _compare_searches(model or "highway", labelled, values))
         look = {"quality": "f1", "label": "scales"}
     else:
+        if model is not None:
+            raise InvalidInputError(f"--model needs a --grid of a search ({', '.join(_SEARCH)}); omit it")
         if vehicles is None or non_vehicles is None:
             raise InvalidInputError(f"--grid of features needs patches to train on; give {PATCHES}")
         options = {"splits": split, "seeds": (seed,), "store": output.with_suffix(".jsonl")}
