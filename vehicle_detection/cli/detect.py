@@ -126,10 +126,10 @@ def detect(options: DetectOptions) -> None:
 
 def _expand(text: str) -> list[_Image]:
     """List the images of a folder, or of a pattern, which the shell of Windows passes on as it is."""
-    from vehicle_detection._common import is_url
+    from vehicle_detection._common import check_path, is_url
     from vehicle_detection.images import list_images
 
-    path = Path(text)
+    path = check_path(text, "IMAGE", kind="an image file")
     if is_url(text):
         return [_Image(text, path.name.partition("?")[0] or "image")]
     has_pattern = ("*" in text or "?" in text) and not path.exists()
