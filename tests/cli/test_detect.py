@@ -117,6 +117,7 @@ def test_a_damaged_but_readable_image_gives_a_warning(picture, tmp_path):
 
 BAD_IMAGES = {
     "{road} --blur plates": "--output must name a folder for --blur",
+    "''": "IMAGE must be a file",
     "missing.png": "IMAGE missing.png does not exist; check the path",
     "{material}/empty": "IMAGE .+empty holds no image file",
     "{material}/clip.mp4": "clip.mp4 is a video; use vehicle-detection video",

@@ -129,6 +129,8 @@ def _expand(text: str) -> list[_Image]:
     from vehicle_detection._common import check_path, is_url
     from vehicle_detection.images import list_images
 
+    if not text.strip():
+        raise InvalidInputError("IMAGE must be a file, a folder or a URL, got an empty name")
     path = check_path(text, "IMAGE", kind="an image file")
     if is_url(text):
         return [_Image(text, path.name.partition("?")[0] or "image")]
