@@ -187,16 +187,15 @@ def trial(place: Place, rng: random.Random) -> tuple[str, list[str]]:
             kill = rng.choice(_SIGNALS), rng.random() * 1.5
             note += f"{signal.Signals(kill[0]).name} after {kill[1]:.2f} s"
         case "full disk":
-            size, before = rng.randrange(1, 60_000), prepare
-            prepare = lambda: (before(), resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)))  # noqa: E731
+            size = rng.randrange(1, 60_000)
+            prepare = _in_turn(prepare, partial(resource.setrlimit, resource.RLIMIT_FSIZE, (size, size)))
             note += f"files of at most {size} bytes"
         case "fake ffmpeg":
             name, action = rng.choice(list(_ACTIONS.items()))
             program, fake = ffmpeg.ffmpeg_binary(), place.folder / "ffmpeg"
             fake.write_text(_FAKE.replace("{action}", action).replace("{program}", program))
             fake.chmod(0o755)
-            before = prepare
-            prepare = lambda: (before(), os.environ.update(FFMPEG_BINARY=str(fake)))  # noqa: E731
+            prepare = _in_turn(prepare, partial(os.environ.update, FFMPEG_BINARY=str(fake)))
             note += f"ffmpeg writes {name}"
         case _:
             call = place.run_batch
@@ -208,6 +207,10 @@ def trial(place: Place, rng: random.Random) -> tuple[str, list[str]]:
     elif os.WIFEXITED(status) and os.WEXITSTATUS(status) == 9:
         problems.append("an error of another class")
     return note, problems
+
+
+def _in_turn(*steps: Callable[[], object]) -> Callable[[], object]:
+    return lambda: [step() for step in steps]
 
 
 def prepare_samples(folder: Path) -> None:

@@ -8,9 +8,11 @@ import time
 import pytest
 
 from tests.video.clips import gray_frames, write_clip
+from vehicle_detection import read_image
+from vehicle_detection._common import web
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.video import ffmpeg as ffmpeg_module
-from vehicle_detection.video import open_source, remote, web
+from vehicle_detection.video import open_source, remote
 
 DASH = """<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011" type="static"
     mediaPresentationDuration="PT1S"><Period><AdaptationSet mimeType="video/mp4"><Representation id="1"
@@ -102,6 +104,8 @@ def test_copies_of_redirected_files(data, tmp_path):
     ):
         with pytest.raises(InvalidInputError, match="private address"):
             remote.download(f"{address}/first.m3u8", tmp_path)
+        with pytest.raises(InvalidInputError, match="private address"):
+            read_image(f"{address}/first.m3u8")
         assert not asked
         assert remote.download(f"{address}/a.ts", tmp_path).read_bytes() == data
 
@@ -139,7 +143,7 @@ def test_headers_that_drip_end_at_a_deadline(tmp_path, monkeypatch):
             handler.wfile.write(f"{name}: {value}\r\n".encode())
         time.sleep(0.2)
 
-    for module in (web, ffmpeg_module, remote):
+    for module in (web, ffmpeg_module):
         monkeypatch.setattr(module, "NETWORK_DEADLINE", 1.0)
     monkeypatch.setattr(remote, "_RETRY_DELAYS", ())
     monkeypatch.setattr(http.server.BaseHTTPRequestHandler, "send_header", send_slowly)

@@ -65,6 +65,5 @@ from vehicle_detection._common.threads import (
     single_threaded_opencv,
 )
 from vehicle_detection._common.units import ROUGH_DISTANCE, UNITS, Units, format_with_error
-from vehicle_detection._common.web import download_bytes
 
 check_environment()

@@ -91,7 +91,7 @@ class FeatureCache:
         if path and path.exists():
             with contextlib.suppress(OSError, ValueError, EOFError):
                 features = np.asarray(np.load(path, allow_pickle=False))
-                if (features.shape, features.dtype) == ((len(self.patches), params.length), np.float32):
+                if features.shape == (len(self.patches), params.length) and features.dtype == np.float32:
                     return features
         patches = np.ascontiguousarray(self.patches[:, :, ::-1]) if mirrored else self.patches
         features = extract_features(patches, params, jobs=self._jobs)

@@ -24,8 +24,8 @@ from typing import IO, Any
 from numpy.typing import NDArray
 
 from vehicle_detection._common import Limit, hide_credentials
+from vehicle_detection._common.web import NETWORK_DEADLINE, NETWORK_TIMEOUT, REFUSED, web_proxy
 from vehicle_detection.errors import TransientVideoError, VideoError
-from vehicle_detection.video.web import NETWORK_DEADLINE, NETWORK_TIMEOUT, REFUSED, web_proxy
 
 _PIPE_BYTES = 1 << 18
 # Signals by which ffmpeg ends itself, because of the file.

@@ -16,6 +16,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._common.web import NETWORK_TIMEOUT
 from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video.ffmpeg import (
     SQUARE_PIXELS,
@@ -29,7 +30,6 @@ from vehicle_detection.video.ffmpeg import (
 from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.queues import ClosableQueue, QueueClosed
 from vehicle_detection.video.reading import Reader
-from vehicle_detection.video.web import NETWORK_TIMEOUT
 from vehicle_detection.video.yuv import ColorEncoding, rgb_from_planes
 
 _LOGGER = logging.getLogger(__name__)

@@ -22,6 +22,7 @@ from vehicle_detection._common import (
     local_path,
     temporary_folder,
 )
+from vehicle_detection._common.web import NETWORK_TIMEOUT
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.ffmpeg import (
     input_options,
@@ -44,7 +45,6 @@ from vehicle_detection.video.sources import (
     VideoSegments,
     exact_rate,
 )
-from vehicle_detection.video.web import NETWORK_TIMEOUT
 
 _LOGGER = logging.getLogger(__name__)
 

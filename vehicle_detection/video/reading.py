@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import Closing, check_number, pluralize
+from vehicle_detection._common.web import NETWORK_DEADLINE
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.video.ffmpeg import (
     Process,
@@ -34,7 +35,6 @@ from vehicle_detection.video.ffmpeg import (
     video_error,
 )
 from vehicle_detection.video.probe import VideoInfo
-from vehicle_detection.video.web import NETWORK_DEADLINE
 from vehicle_detection.video.yuv import FORMATS, rgb_from_planes
 
 _LOGGER = logging.getLogger(__name__)

@@ -11,14 +11,13 @@ from typing import Any, TypeVar
 from urllib.parse import unquote
 
 from vehicle_detection._common import hide_credentials
+from vehicle_detection._common.web import read_http
 from vehicle_detection.errors import InvalidInputError, TransientVideoError
-from vehicle_detection.video.web import MIN_RATE, NETWORK_DEADLINE, NETWORK_TIMEOUT, REFUSED, web_proxy
 
 Result = TypeVar("Result")
 
 # Seconds before the second and the third attempt of a request.
 _RETRY_DELAYS = (0.2, 1.0)
-_CHUNK_BYTES = 1 << 20
 # Maximum length of a file name, in characters that may take four bytes each.
 _MAX_NAME = 60
 _FINAL_ERRORS = (FileNotFoundError, PermissionError, NotImplementedError, TypeError, AttributeError)
@@ -57,24 +56,9 @@ def file_name(url: str) -> str:
 
 
 def _download_http(url: str, path: Path) -> None:
-    import requests
-
-    proxy = web_proxy(url)
-    proxies = {"http": proxy, "https": proxy} if proxy else None
-    with requests.get(url, stream=True, timeout=NETWORK_TIMEOUT, proxies=proxies) as answer:
-        if answer.status_code == REFUSED and proxy:
-            raise PermissionError(answer.reason)
-        if answer.status_code in (404, 410):
-            raise FileNotFoundError(url)
-        answer.raise_for_status()
-        begun, size = time.monotonic(), 0
-        read = getattr(answer.raw, "read1", answer.raw.read)  # urllib3 before 2.2 lacks it
-        with path.open("wb") as file:
-            while data := read(_CHUNK_BYTES, decode_content=True):
-                size += file.write(data)
-                elapsed = time.monotonic() - begun
-                if elapsed > NETWORK_DEADLINE and size < MIN_RATE * elapsed:
-                    raise TimeoutError(f"only {size} bytes in {elapsed:.0f} s")
+    with path.open("wb") as file:
+        for data in read_http(url):
+            file.write(data)
 
 
 def with_retries(request: Callable[[], Result]) -> Result:
