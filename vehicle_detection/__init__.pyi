@@ -2,7 +2,7 @@ from . import course, datasets, drive, evaluation, notebook, tracking, training
 from .annotator import Annotator, DrawParams, draw_diagnostics, draw_tracks
 from .boxes import Detections, clip_boxes, iou_matrix, non_max_suppression
 from .camera import Camera, open_camera, read_camera, write_camera
-from .course import HeatmapDetector, draw_labeled_bboxes, get_hog_features
+from .course import HeatmapDetector, bin_spatial, color_hist, draw_labeled_bboxes, get_hog_features
 from .datasets import FrameSet, PatchSet, fetch_patches, load_frames, load_patches, load_training_patches
 from .detector import Detector, VehicleDetector, detect, load_model
 from .drawing import blur_boxes, draw_boxes, draw_detections
@@ -102,9 +102,11 @@ __all__ = [
     "add_heat",
     "annotate_clip",
     "apply_threshold",
+    "bin_spatial",
     "blur_boxes",
     "bounding_boxes",
     "clip_boxes",
+    "color_hist",
     "convert_color",
     "count_vehicles",
     "course",
