@@ -45,7 +45,6 @@ from vehicle_detection.drawing import (
     Rectangle,
     blur_boxes,
     cap_height,
-    color_index,
     draw_boxes,
     draw_labels,
     draw_outline,
@@ -57,6 +56,7 @@ from vehicle_detection.drawing import (
     round_box,
     text_scale,
     text_size,
+    track_color,
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import HeatParams, frame_heat
@@ -64,10 +64,6 @@ from vehicle_detection.tracking import FrameResult, Track
 
 # Frame rate that is assumed for results without times.
 _USUAL_FPS = 25.0
-_UNKNOWN_COLOR: Color = (160, 160, 160)
-# Distances (m) and their colors; between them, colors are interpolated over the logarithm of the distance.
-_DISTANCES = (10.0, 20.0, 35.0, 60.0)
-_DISTANCE_COLORS = ((213, 94, 0), (230, 159, 0), (240, 228, 66), (86, 180, 233))
 
 LABEL_FIELDS = ("id", "score", "distance", "speed", "std")
 """Fields of a track's label; ``"std"`` adds standard errors to distance and speed."""
@@ -512,23 +508,6 @@ def draw_tracks(
     """
     style = DrawParams(labels=labels, line_width=line_width, color_by=color_by)
     return Annotator(style).draw_tracks(image, tracks)
-
-
-def track_color(track: Track, color_by: Literal["id", "distance"] = "id") -> Color:
-    """RGB color of a track, chosen by its id or its distance; gray for a tentative track."""
-    if color_by == "distance":
-        return _distance_color(track.distance_m)
-    return TRACK_COLORS[color_index(track.id)] if track.id > 0 else _UNKNOWN_COLOR
-
-
-def _distance_color(distance_m: float | None) -> Color:
-    if distance_m is None:
-        return _UNKNOWN_COLOR
-    position = math.log(max(distance_m, _DISTANCES[0]))
-    red, green, blue = (
-        round(float(np.interp(position, np.log(_DISTANCES), values))) for values in zip(*_DISTANCE_COLORS)
-    )
-    return red, green, blue
 
 
 def track_fields(

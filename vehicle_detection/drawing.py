@@ -10,7 +10,7 @@ import functools
 import math
 import re
 from collections.abc import Hashable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -29,6 +29,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tracking import Track
 
 Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
@@ -43,6 +44,10 @@ TRACK_COLORS: tuple[Color, ...] = (
 )  # fmt: skip
 """RGB colors that color-blind viewers can tell apart (Okabe and Ito, *Color Universal Design*, 2008)."""
 
+_UNKNOWN_COLOR: Color = (160, 160, 160)
+# Distances (m) and their colors; between them, colors are interpolated over the logarithm of the distance.
+_DISTANCES = (10.0, 20.0, 35.0, 60.0)
+_DISTANCE_COLORS = ((213, 94, 0), (230, 159, 0), (240, 228, 66), (86, 180, 233))
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 # Length of a dash in line widths, and at most as a fraction of a side.
 _DASH_WIDTHS, _DASH_FRACTION = 4, 0.2
@@ -51,6 +56,23 @@ _DASH_WIDTHS, _DASH_FRACTION = 4, 0.2
 def color_index(track_id: int) -> int:
     """Index of the color of a track with an id in `TRACK_COLORS`."""
     return (track_id - 1) % len(TRACK_COLORS)
+
+
+def track_color(track: Track, color_by: Literal["id", "distance"] = "id") -> Color:
+    """RGB color of a track, chosen by its id or its distance; gray for a tentative track."""
+    if color_by == "distance":
+        return _distance_color(track.distance_m)
+    return TRACK_COLORS[color_index(track.id)] if track.id > 0 else _UNKNOWN_COLOR
+
+
+def _distance_color(distance_m: float | None) -> Color:
+    if distance_m is None:
+        return _UNKNOWN_COLOR
+    position = math.log(max(distance_m, _DISTANCES[0]))
+    red, green, blue = (
+        round(float(np.interp(position, np.log(_DISTANCES), values))) for values in zip(*_DISTANCE_COLORS)
+    )
+    return red, green, blue
 
 
 def blend(image: NDArray[Any], overlay: ArrayLike, alpha: float) -> NDArray[Any]:

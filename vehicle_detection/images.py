@@ -23,6 +23,7 @@ from vehicle_detection._common import (
     check_image,
     check_path,
     describe,
+    download_bytes,
     hide_credentials,
     is_hidden,
     is_url,
@@ -149,8 +150,6 @@ def read_image(path: str | os.PathLike[str] | bytes) -> NDArray[np.uint8]:
             f"path must be a file name or bytes, got {describe(path)}; pass bytes(...) or stream.getvalue()"
         )
     if isinstance(path, str) and is_url(path := local_path(path)):
-        from vehicle_detection._common.web import download_bytes
-
         return decode_image(download_bytes(path, Limit.IMAGE_BYTES), f"image {hide_credentials(path)}")
     name = f"image file {(file := check_path(path))}"
     return decode_image(read_regular_file(file, name, Limit.IMAGE_BYTES), name)

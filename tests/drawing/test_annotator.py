@@ -16,12 +16,11 @@ from vehicle_detection.annotator import (
     draw_diagnostics,
     draw_tracks,
     road_position,
-    track_color,
     track_fields,
 )
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
-from vehicle_detection.drawing import TRACK_COLORS, blur_boxes, color_index
+from vehicle_detection.drawing import TRACK_COLORS, blur_boxes, color_index, track_color
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes import SceneVehicle, render_scene
 from vehicle_detection.tracking import FrameResult

@@ -65,5 +65,14 @@ from vehicle_detection._common.threads import (
     single_threaded_opencv,
 )
 from vehicle_detection._common.units import ROUGH_DISTANCE, UNITS, Units, format_with_error
+from vehicle_detection._common.web import (
+    MIN_RATE,
+    NETWORK_DEADLINE,
+    NETWORK_TIMEOUT,
+    REFUSED,
+    download_bytes,
+    read_http,
+    web_proxy,
+)
 
 check_environment()

@@ -1,7 +1,8 @@
 from .batch import BatchReport, run_batch
 from .batch_store import BatchStatus, batch_status, batch_summary, with_source
 from .counts import COUNTED, MinuteCounts, VehicleCounts, count_vehicles
-from .events import EVENT_COLUMNS, EVENT_SUFFIXES, KINDS, Event, cut_clips, find_events, write_events
+from .event_files import EVENT_SUFFIXES, cut_clips, write_events
+from .events import EVENT_COLUMNS, KINDS, Event, find_events
 from .own_speed import OwnSpeed, own_speeds, read_own_speed
 from .report import ReportWriter, explain_tracks
 from .report_page import TrackPicture

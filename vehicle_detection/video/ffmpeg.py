@@ -23,8 +23,14 @@ from typing import IO, Any
 
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Limit, hide_credentials
-from vehicle_detection._common.web import NETWORK_DEADLINE, NETWORK_TIMEOUT, REFUSED, web_proxy
+from vehicle_detection._common import (
+    NETWORK_DEADLINE,
+    NETWORK_TIMEOUT,
+    REFUSED,
+    Limit,
+    hide_credentials,
+    web_proxy,
+)
 from vehicle_detection.errors import TransientVideoError, VideoError
 
 _PIPE_BYTES = 1 << 18

@@ -16,7 +16,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common.web import NETWORK_TIMEOUT
+from vehicle_detection._common import NETWORK_TIMEOUT
 from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video.ffmpeg import (
     SQUARE_PIXELS,

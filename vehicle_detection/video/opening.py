@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from vehicle_detection._common import (
+    NETWORK_TIMEOUT,
     check_flags,
     check_integer,
     check_number,
@@ -22,7 +23,6 @@ from vehicle_detection._common import (
     local_path,
     temporary_folder,
 )
-from vehicle_detection._common.web import NETWORK_TIMEOUT
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.ffmpeg import (
     input_options,

@@ -18,8 +18,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Closing, check_number, pluralize
-from vehicle_detection._common.web import NETWORK_DEADLINE
+from vehicle_detection._common import NETWORK_DEADLINE, Closing, check_number, pluralize
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.video.ffmpeg import (
     Process,

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import unquote
 
-from vehicle_detection._common import hide_credentials
-from vehicle_detection._common.web import read_http
+from vehicle_detection._common import hide_credentials, read_http
 from vehicle_detection.errors import InvalidInputError, TransientVideoError
 
 Result = TypeVar("Result")
