@@ -66,7 +66,6 @@ from vehicle_detection._common.threads import (
 )
 from vehicle_detection._common.units import ROUGH_DISTANCE, UNITS, Units, format_with_error
 from vehicle_detection._common.web import (
-    MIN_RATE,
     NETWORK_DEADLINE,
     NETWORK_TIMEOUT,
     REFUSED,

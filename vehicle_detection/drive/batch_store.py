@@ -49,6 +49,7 @@ _FOLDER = "records"
 _TEXTS = ("message", "camera", "date", "start", "damage")
 _NUMBERS, _MAX_NUMBER = ("frames", "tracks", "video_seconds", "seconds"), 1e15
 _MAX_RECORD_BYTES = 100_000_000
+_OUTPUT = re.compile(r"(?:tracks|videos)/date=[^/\\]+/camera=[^/\\]+/([^/\\]+)\.(?:parquet|mp4)")
 _SUMMARY_COLUMNS = (
     "key", "status", "camera", "date", "start", "first_file", "files", "frames", "video_seconds", "tracks",
     "work_seconds", "message", "damage", "tracks_file", "video_file",
@@ -315,6 +316,12 @@ def read_records(store: Store, keys: Iterable[str] | None = None) -> dict[str, d
     return {key: record for key, record in parsed if record is not None}
 
 
+def _is_output(key: str, path: str) -> bool:
+    """Whether a path is that of a trip's output: those of a record may be removed, and nothing else."""
+    parts = _OUTPUT.fullmatch(path)
+    return parts is not None and parts[1] == key
+
+
 def _parse(key: str, data: bytes) -> dict[str, Any] | None:
     """Record of a trip, from a file that anybody may have changed; None if it is of another shape."""
     try:
@@ -325,13 +332,11 @@ def _parse(key: str, data: bytes) -> dict[str, Any] | None:
         return None
     given = {name: value for name, value in record.items() if value is not None}
     sources, outputs = given.get("sources"), given.get("outputs", {})
-    # The outputs of a record may be removed: they are files of this trip, and nothing else.
-    output = rf"(tracks|videos)/date=[^/\\]+/camera=[^/\\]+/{re.escape(key)}\.(parquet|mp4)"
     if not (isinstance(sources, list) and isinstance(outputs, dict) and sources):
         return None
     whole = (
         all(isinstance(each, dict) and isinstance(each.get("uri"), str) for each in sources)
-        and all(isinstance(path, str) and re.fullmatch(output, path) for path in outputs.values())
+        and all(isinstance(path, str) and _is_output(key, path) for path in outputs.values())
         and all(isinstance(given.get(name, ""), str) for name in _TEXTS)
         and all(isinstance(given.get(name, 0), (int, float)) for name in _NUMBERS)
         and all(0 <= given.get(name, 0) < _MAX_NUMBER for name in _NUMBERS)
