@@ -105,7 +105,7 @@ class Detections:
             )
         vars(self).update(boxes=boxes, scores=scores, confidences=confidences)
         if self.labels is not None:
-            labels = np.atleast_1d(np.asarray(self.labels)).tolist()
+            labels = check_sequence(self.labels, "labels", "names of the classes of boxes")
             if len(labels) != len(boxes) or not all(isinstance(label, str) for label in labels):
                 raise InvalidInputError(
                     f"labels must be a name for each of the {len(boxes)} boxes, got {describe(self.labels)}"
