@@ -30,7 +30,12 @@ RESULT = FrameResult(0, None, NONE, NONE, ())
     [
         ("plot_channels", [IMAGE, "XYZ"], {}, "color_space"),
         ("plot_channels", [[IMAGE]], {"labels": [1, 0]}, "labels"),
-        ("plot_hog", [gray_image(30, 30)], {"pix_per_cell": [16]}, "img must have at least the size of"),
+        (
+            "plot_hog",
+            [gray_image(30, 30)],
+            {"pix_per_cell": [16]},
+            "images.0. must have at least the size",
+        ),
         ("plot_features", [PATCHES, MODEL], {"rows": [3]}, "rows"),
         ("plot_features", [PATCHES, MODEL], {"names": ["a", "b"]}, "names"),
         ("plot_features", [PATCHES, "m"], {}, "model must be .* pass load_classifier"),

@@ -195,9 +195,14 @@ def plot_hog(
     listed, names = style.split_titles([images] if single else images)
     sizes = style.check_list(pix_per_cell, "pix_per_cell", "cell sizes")
     cell_sizes = [check_integer(cell, "pix_per_cell", low=2) for cell in sizes]
-    columns = []
+    columns, side = [], max(cell_sizes) * params.cell_per_block
     for index, (image, name) in enumerate(zip(listed, names)):
         source = hog_source(check_image(image, f"images[{index}]"), params)
+        if min(source.shape[:2]) < side:
+            raise InvalidInputError(
+                f"images[{index}] must have at least the size of a block ({side}x{side} pixels), got "
+                f"{describe(image)}; pass a larger image or a smaller pix_per_cell"
+            )
         for channel, letter in enumerate(hog_channel_names(params)):
             columns.append((source[..., channel], f"{name}: {letter}" if name else letter))
     width = min(2.2, 12.5 / len(columns)) if len(columns) > 1 else 6.0

@@ -91,7 +91,8 @@ def write_results(table: DataFrame, path: str | os.PathLike[str]) -> None:
         elif suffix == ".parquet":
             table.to_parquet(part, index=False)
         else:
-            part.write_text("".join(map(_format_row, table.to_dict("records"))), encoding="utf-8")
+            text = "".join(map(_format_row, table.to_dict("records")))
+            part.write_text(text, encoding="utf-8", newline="\n")
 
 
 def read_results(path: str | os.PathLike[str]) -> DataFrame:

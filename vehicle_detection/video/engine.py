@@ -491,7 +491,7 @@ def track(
     0 0.0 (720, 1280, 3) 2
     1 0.04 (720, 1280, 3) 4
     >>> track("test_images/*.jpg", "highway", end=0.08).to_pandas()[["frame", "track_id", "time_s"]].shape
-    (2, 3)
+    (5, 3)
     """
     check_flags(frames=frames, progress=progress)
     start, end = check_span(start, end)
