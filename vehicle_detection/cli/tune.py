@@ -52,7 +52,7 @@ def tune(
     ),
     vehicles: Path | None = option(None, "PATH", "Patches of vehicles to train on, such as vehicles.zip."),
     non_vehicles: Path | None = option(None, "PATH", "Other patches, such as non-vehicles.zip."),
-    model: str | None = option(None, "FILE", "Model of the search, such as my.safetensors; default: highway."),
+    model: str | None = option(None, "FILE", "Model of the search, such as a.safetensors; default: highway."),
     plot: Path | None = option(None, "FILE.png", "Accuracy against search time."),
     split: str = option("sequences", "sequences|groups|random", "Held-out patches."),
     halving: bool = flag("--halving", "Eliminate poor configurations on few patches (successive halving)."),
