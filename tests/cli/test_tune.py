@@ -133,6 +133,8 @@ def test_tune_refuses_bad_input(patches, material, tmp_path, monkeypatch):
         "{patches} {grid} -o t.csv --horizon 0.5": "--horizon needs --frames",
         "--vehicles missing.zip {others} {grid} -o t.csv": "missing.zip does not exist",
         "{patches} {grid} -o a.jsonl": "is not a table of trials",
+        "{patches} {grid} -o a.csv": "--output a.csv exists and is no table of tune",
+        "--grid scales=1 {frames} -o a.jsonl": "--output a.jsonl exists and is no table of tune",
         "--vehicles a.csv {others} {grid} -o a.csv": "is also --vehicles",
     }
     vehicles, others = (f"{name} {path}" for name, path in (patches[:2], patches[2:]))

@@ -73,10 +73,14 @@ def tune(
     given = {name: path for name, path in sources.items() if path is not None}
     targets = check_targets({"--output": output, "--plot": plot}, given)
     check_suffix(output, "--output", (".csv", ".jsonl", ".parquet"))
+    searches = set(values) <= set(_SEARCH)
+    writes_table = searches or output.suffix.lower() != ".jsonl"  # rows of trials are stored one by one
+    if writes_table:
+        vd.training.check_replaceable(output, "--output")
     if plot is not None:
         check_suffix(plot, "--plot", (".png", ".svg", ".pdf"))
     labelled = _read_frames(frames, labels, horizon)
-    if set(values) <= set(_SEARCH):
+    if searches:
         if labelled is None:
             raise InvalidInputError("--grid of a search needs labelled frames; give --frames and --labels")
         table = run_interruptible(lambda: _compare_searches(model or "highway", labelled, values))
@@ -90,7 +94,7 @@ def tune(
         options["options"] = vd.training.TrialOptions(frames=labelled, cache=cache)
         count = finalists if halving else None
         table, look = _compare_models((vehicles, non_vehicles), values, options, count), {}
-    if output.suffix.lower() != ".jsonl" or set(values) <= set(_SEARCH):
+    if writes_table:
         vd.training.write_results(table, output)
     if plot is not None:
         _draw(table, plot, look)

@@ -36,6 +36,7 @@ from .pipeline import to_pipeline as to_pipeline
 from .rendered import rendered_source as rendered_source
 from .results import RowStore as RowStore
 from .results import check_column as check_column
+from .results import check_replaceable as check_replaceable
 from .results import make_table as make_table
 from .results import numeric_column as numeric_column
 from .results import pareto_front as pareto_front

@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -93,6 +94,26 @@ def write_results(table: DataFrame, path: str | os.PathLike[str]) -> None:
         else:
             text = "".join(map(_format_row, table.to_dict("records")))
             part.write_text(text, encoding="utf-8", newline="\n")
+
+
+def check_replaceable(path: str | os.PathLike[str], name: str) -> None:
+    """Raise if a file exists that is no table of trials or searches, before one is written in its place."""
+    import pandas as pd
+
+    file = Path(path)
+    if not file.is_file() or not file.stat().st_size:
+        return
+    try:
+        if file.suffix.lower() == ".parquet":
+            columns = set(import_pyarrow().parquet.read_schema(file).names)
+        elif file.suffix.lower() == ".csv":
+            columns = set(pd.read_csv(file, nrows=0).columns)
+        else:
+            columns = set(_read_lines(file)[1][0])
+    except (DatasetError, LookupError, OSError, ValueError):
+        columns = set()
+    if not any(own <= columns for own in ({"configuration", "accuracy"}, {"scales", "f1"})):
+        raise InvalidInputError(f"{name} {file} exists and is no table of tune; choose another file")
 
 
 def read_results(path: str | os.PathLike[str]) -> DataFrame:
