@@ -29,7 +29,7 @@ from tests.helpers import ROOT
 from tests.video.clips import gray_frames, write_clip
 from vehicle_detection import detector
 from vehicle_detection._kernels.jit import jit
-from vehicle_detection.drive import events
+from vehicle_detection.drive import event_files, events
 from vehicle_detection.images import write_image
 from vehicle_detection.scenes import render_scene
 
@@ -198,14 +198,14 @@ def test_an_interrupt_while_clips_are_cut_keeps_all_other_files(clip, tmp_path, 
         for number, kind in enumerate(kinds)
     )
     monkeypatch.setattr("vehicle_detection.find_events", lambda *_, **__: found)
-    cut = events.cut_video
+    cut = event_files.cut_video
 
     def interrupt(source, target, **options):
         if "closing" in target.name:
             raise KeyboardInterrupt
         return cut(source, target, **options)
 
-    monkeypatch.setattr(events, "cut_video", interrupt)
+    monkeypatch.setattr(event_files, "cut_video", interrupt)
     outputs = {"-o": "o.mp4", "--tracks": "o.csv", "--report": "o.html", "--events": "o.json"}
     outputs["--srt"] = "o.srt"
     words = [word for option, name in outputs.items() for word in (option, tmp_path / name)]

@@ -27,6 +27,7 @@ from tests.video.clips import (
     write_beep,
     write_clip,
 )
+from vehicle_detection._common import web
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.images import write_image
 from vehicle_detection.video import ffmpeg as ffmpeg_module
@@ -532,7 +533,7 @@ def test_a_server_that_sends_too_little_fails_at_a_deadline(folder, tmp_path, mo
             request.wfile.write(data[place : place + 1])
             time.sleep(0.2)
 
-    for module in (ffmpeg_module, reading, remote):
+    for module in (ffmpeg_module, reading, web):
         monkeypatch.setattr(module, "NETWORK_DEADLINE", 1.5)
     with server(serve) as address:
         with pytest.raises(TransientVideoError, match=r"slow.mp4 cannot be copied \(only"):
