@@ -272,6 +272,7 @@ def identity_of(pattern):
     ("options", "message"),
     [
         ({"sources": "missing"}, "sources missing does not exist"),
+        ({"sources": ""}, "sources must be files, folders, patterns or URLs, got ''; pass their names"),
         ({"sources": "*.mp4"}, r"sources \*\.mp4 holds no videos"),
         ({"sources": 3}, "sources must be files"),
         ({"shard": "0/3"}, "shard must be a number and a count, such as 3/200"),

@@ -43,9 +43,9 @@ def list_videos(sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str
     single = isinstance(sources, (str, os.PathLike))
     given = (sources,) if single else check_sequence(sources, "sources", "files, folders, patterns or URLs")
     for source in given:
-        if not isinstance(source, (str, os.PathLike)):
+        if not isinstance(source, (str, os.PathLike)) or not str(source).strip():
             raise InvalidInputError(
-                f"sources must be files, folders, patterns or URLs, got {describe(source)}; pass strings"
+                f"sources must be files, folders, patterns or URLs, got {describe(source)}; pass their names"
             )
         text = local_path(os.fspath(source))
         if not is_url(text):
