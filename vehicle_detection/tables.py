@@ -47,6 +47,7 @@ VEHICLE_CLASSES = ("car", "van", "truck", "bus", "vehicle")
 LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autorickshaw", "vehicle fallback")
 """Classes whose boxes are vehicles by default, and classes whose labels are ignored."""
 _CLASS_COLUMNS = ("class", "label", "category")
+_OWN_COLUMNS = ({"score", "confidence", "label"}, {"track_id", "label", *LABEL_COLUMNS})  # of written files
 
 _FLAGS = {"false": False, "true": True, "0": False, "1": True, "0.0": False, "1.0": True}
 # Distances and speeds beyond the first are unknown, corners of boxes are errors.
@@ -87,10 +88,9 @@ class TrackTable:
 
     ``table["score"]`` is a column, named as in the files; one that the table lacks is full of its default.
     ``table[rows]`` selects rows by an index, a slice, a mask or a list and keeps all frame keys; `frame` and
-    `select` keep only theirs. Iterating yields the key and the table of each frame.
-
-    A table of a video grows by `append`, which sets `first_time`, the time of the video's first frame in
-    seconds, None if unknown. Selections keep it, even without that frame.
+    `select` keep only theirs. Iterating yields the key and the table of each frame. A table of a video grows
+    by `append`, which sets `first_time`, the time of the video's first frame in seconds, None if unknown.
+    Selections keep it, even without that frame.
 
     Parameters
     ----------
@@ -533,7 +533,7 @@ def _vehicle_rows(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], list[str] | None]:
     """Mark the rows to keep, and the labels of lookalikes among them, by the columns of classes.
 
-    Also returns the class of each row, None if the file has none. Files of `write_tracks` hold vehicles only.
+    Also returns the class of each row, None if the file has none. Files written here hold vehicles only.
     """
     count = len(cells["frame"])
     given = [cells[name] for name in _CLASS_COLUMNS if name in cells]
@@ -541,7 +541,7 @@ def _vehicle_rows(
     found = {*names} - {""}
     # Classes that are numbers or flags have no names: all rows are vehicles.
     known = bool(found) and not any(re.fullmatch(r"[-\d.]+|true|false", name) for name in found)
-    if not known or (classes is None and cells.keys() >= {"score", "confidence", "label"}):
+    if not known or (classes is None and any(cells.keys() >= own for own in _OWN_COLUMNS)):
         return np.ones(count, np.bool_), np.zeros(count, np.bool_), names if known else None
     wanted = VEHICLE_CLASSES if classes is None else classes
     check_classes(source, found, wanted)

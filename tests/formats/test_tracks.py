@@ -172,12 +172,15 @@ def test_coco_is_a_data_set(tmp_path):
     data = json.loads((tmp_path / "t.json").read_text())
     assert [(image["id"], image["frame"]) for image in data["images"]] == [(1, 0), (2, 1), (3, 2)]
     assert all((image["height"], image["width"]) == (720, 1280) for image in data["images"])
-    assert data["categories"] == [{"id": 1, "name": "vehicle", "supercategory": "vehicle"}]
+    assert data["categories"] == [
+        {"id": 1, "name": "vehicle", "supercategory": "vehicle"},
+        {"id": 2, "name": "car", "supercategory": "vehicle"},
+    ]
     first, second, third = data["annotations"]
     assert first == {
         "id": 1,
         "image_id": 1,
-        "category_id": 1,
+        "category_id": 2,
         "bbox": [10.0, 20.0, 40.25, 40.5],
         "area": 1630.12,
         "iscrowd": 0,

@@ -161,6 +161,58 @@ def test_kitti_folders_hold_frames_and_what_is_visible(tmp_path_factory, boxes):
     assert read["ignore"][~cars].all()
 
 
+KINDS = ["truck", "vehicle", "bus", "car", "auto rickshaw"]
+WITH_CLASSES = [
+    ("t.csv", None),
+    ("t.jsonl", None),
+    ("t.parquet", None),
+    ("t.json", "coco"),
+    ("t.zip", "mot_zip"),
+    ("yolo", "yolo"),
+    ("kitti", "kitti"),
+]
+
+
+@pytest.mark.parametrize(("name", "form"), WITH_CLASSES)
+@pytest.mark.parametrize("scored", [False, True])
+def test_classes_are_read_back(tmp_path, caplog, name, form, scored):
+    rows = [(row, row + 1, moved(3 * row), 0.5) if scored else (row, row + 1, CAR) for row in range(5)]
+    boxes = boxes_of(*rows, label=KINDS, confidence=[0.6] * 5 if scored else None)
+    boxes = boxes.renamed(lambda frame: f"{frame:06d}") if form == "kitti" else boxes
+    shape = {"shape": (720, 1280)} if form == "yolo" else {}
+    write_labels(boxes, tmp_path / name, format=form, **shape)
+    expected = list(KINDS)
+    if form == "kitti":  # it has no type of all vehicles, and no spaces in types
+        expected[1], expected[4] = "car", "auto_rickshaw"
+    assert read_labels(tmp_path / name, classes=set(expected), **shape)["label"].tolist() == expected
+    # Classes of other names are kept where the file tells that they are vehicles, else a warning names them.
+    read = read_labels(tmp_path / name, **shape)
+    assert len(read[~read["ignore"]]) == (5 if form is None else 4)
+    assert ("'auto rickshaw' are read back only if" in caplog.text) == (form is not None)
+
+
+@pytest.mark.parametrize(("name", "form"), WITH_CLASSES[3:6])
+def test_boxes_without_classes_get_none(tmp_path, name, form):
+    write_labels(boxes_of((0, 1, CAR)), tmp_path / name, format=form, shape=(720, 1280))
+    if form == "yolo":
+        assert (tmp_path / "yolo" / "data.yaml").read_text() == "names:\n  0: vehicle\n"
+    assert "label" not in read_labels(tmp_path / name, shape=(720, 1280)).columns
+
+
+def test_results_take_the_categories_of_their_truth(tmp_path):
+    labels = boxes_of((0, 1, CAR), (1, 1, CAR), label=["bus", "car"])
+    truth, results = tmp_path / "truth.json", tmp_path / "results.json"
+    write_labels(labels, truth)
+    found = boxes_of((0, 1, CAR, 0.5), (1, 1, CAR, 0.25), label=["bus", "car"])
+    write_labels(found, results, format="coco_results", truth=truth)
+    assert [entry["category_id"] for entry in json.loads(results.read_text())] == [5, 2]
+    assert read_labels(results, truth=truth)["label"].tolist() == ["bus", "car"]
+    with pytest.raises(
+        InvalidInputError, match="those of the boxes, which include 'vehicle', got 'car', 'bus'"
+    ):
+        write_labels(boxes_of((0, 1, CAR, 0.5)), results, format="coco_results", truth=truth)
+
+
 # --- motmetrics ---
 
 
@@ -287,7 +339,8 @@ def test_results_take_the_ids_of_a_foreign_ground_truth(tmp_path):
     truth.write_text(json.dumps(document))
     with pytest.raises(InvalidInputError, match="truth must have one category of vehicles"):
         write_labels(found, results, format="coco_results", truth=truth)
-    write_labels(read_labels(truth), tmp_path / "vehicles.json", truth=truth)
+    without = TrackTable.from_pandas(read_labels(truth).to_pandas().drop(columns="label"))
+    write_labels(without, tmp_path / "vehicles.json", truth=truth)
     write_labels(found, results, format="coco_results", truth=tmp_path / "vehicles.json")
     assert [entry["image_id"] for entry in json.loads(results.read_text())] == [17, 900]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.formats.rows import Record, read_text
+from vehicle_detection.formats.rows import ClassNumbers, Record, class_name, read_text
 from vehicle_detection.tables import (
     CORNERS,
     LOOKALIKE_CLASSES,
@@ -37,7 +37,6 @@ _OTHER_TOOLS = (
     ({"items", "categories", "info"}, "Datumaro"),
     ({"objects", "size"}, "Supervisely"),
 )
-_CATEGORIES = [{"id": 1, "name": "vehicle", "supercategory": "vehicle"}]
 
 
 def json_reason(error: ValueError | RecursionError) -> str:
@@ -136,7 +135,7 @@ def read_coco(
         if entry.get("iscrowd") and not (entry.get("ignore") and "track_id" in entry):
             track = NO_TRACK
         record = {name: entry.get(name) for name in (*TRACK_COLUMNS[6:-1], "occluded", "truncated")}
-        record |= {"frame": frame, "track_id": track, "ignore": ignore}
+        record |= {"frame": frame, "track_id": track, "ignore": ignore, "label": file.categories[category]}
         rows.append((where, record | dict(zip(CORNERS, (x, y, x + width, y + height)))))
     return rows, list(file.images.values())
 
@@ -175,11 +174,11 @@ class Truth(NamedTuple):
     """A ground truth whose ids are written."""
 
     images: Mapping[FrameKey, Mapping[str, Any]]
-    category: Any = 1
+    categories: Mapping[str, Any]  # id of each class of vehicles
 
 
 def read_truth(labels: TrackTable, truth: Path, *, results: bool) -> Truth:
-    """Images of the frames of a ground truth and, for `results`, its category of vehicles."""
+    """Images of the frames of a ground truth and, for `results`, its categories of vehicles."""
     file = _read_file(truth)
     images = dict(zip(file.images.values(), file.entries))
     keys = labels["frame"].tolist() if results else labels.frame_keys
@@ -191,22 +190,27 @@ def read_truth(labels: TrackTable, truth: Path, *, results: bool) -> Truth:
             "use the same names (labels.renamed), or drop these boxes"
         )
     if not results:
-        return Truth(images)
-    categories = _vehicle_categories(file, truth, None)
-    if len(categories) != 1:
-        listed = ", ".join(repr(file.categories[number]) for number in categories) or "none"
+        return Truth(images, {})
+    vehicles, names = _vehicle_categories(file, truth, None), {*map(class_name, labels["label"])}
+    categories = {name: number for number, name in file.categories.items()}
+    if len(vehicles) == 1:
+        categories |= dict.fromkeys(names, *vehicles)
+    missing = min(names - categories.keys(), default=None)
+    if missing is not None:
+        listed = ", ".join(map(repr, categories)) or "none"
         raise InvalidInputError(
-            f"truth must have one category of vehicles, as the boxes have none, got {listed}; join them with "
-            "write_labels(read_labels(truth), 'vehicles.json', truth=truth) and pass that file"
+            f"truth must have one category of vehicles, or those of the boxes, which include {missing!r}, "
+            f"got {listed}; without its classes: write_labels(TrackTable.from_pandas(read_labels(truth)"
+            ".to_pandas().drop(columns='label')), 'vehicles.json', truth=truth), and pass that file"
         )
-    return Truth(images, categories.pop())
+    return Truth(images, categories)
 
 
-def _result(record: Record, truth: Truth | None) -> Record:
+def _result(record: Record, category: Any, truth: Truth | None) -> Record:
     """COCO result: box, score and, if known, track, distance, speed and confidence of one detection."""
     image = _image_entry(record["frame"], None) if truth is None else truth.images[record["frame"]]
     x1, y1, x2, y2 = (record[name] for name in CORNERS)
-    result: Record = {"image_id": image["id"], "category_id": 1 if truth is None else truth.category}
+    result: Record = {"image_id": image["id"], "category_id": category}
     result["bbox"] = [x1, y1, without_noise(x2 - x1), without_noise(y2 - y1)]
     known = {name: record.get(name) for name in ("score", "track_id", *TRACK_COLUMNS[7:-1])}
     known |= {"track_id": None} if known["track_id"] == NO_TRACK else {}
@@ -220,14 +224,15 @@ def open_coco(part: Path, shape: tuple[int, ...] | None, truth: Truth | None) ->
     Ignored rows are crowds, because pycocotools overwrites ``ignore`` with ``iscrowd``.
     """
     frames: set[FrameKey] = set()
-    count = 0
+    count, numbers = 0, ClassNumbers()
 
     def write(frame: FrameKey, records: Sequence[Record]) -> None:
         nonlocal count
         frames.add(frame)
         for record in records:
             count += 1
-            result, ignore = _result(record, truth), record.get("ignore", False)
+            result = _result(record, numbers.number(record) + 1, truth)
+            ignore = record.get("ignore", False)
             width, height = result["bbox"][2:]
             flags = {"area": round(width * height, 2), "iscrowd": int(ignore)}
             flags |= {"ignore": 1} if ignore else {}
@@ -240,13 +245,20 @@ def open_coco(part: Path, shape: tuple[int, ...] | None, truth: Truth | None) ->
         yield write
         ordered = sorted(frames, key=lambda key: (isinstance(key, str), key))
         images = [_image_entry(key, shape) for key in ordered] if truth is None else [*truth.images.values()]
-        rest = json.dumps({"images": images, "categories": _CATEGORIES}, ensure_ascii=False)
+        categories = [
+            {"id": number, "name": name, "supercategory": "vehicle"}
+            for number, name in enumerate(numbers.names, 1)
+            if name in (numbers.used or numbers.names)
+        ]
+        rest = json.dumps({"images": images, "categories": categories}, ensure_ascii=False)
         file.write(f"], {rest[1:]}")
 
 
 @contextlib.contextmanager
-def open_coco_results(part: Path, truth: Truth | None) -> Iterator[Write]:
+def open_coco_results(part: Path, truth: Truth) -> Iterator[Write]:
     """Write the list of results that ``COCO.loadRes`` of pycocotools takes."""
     results: list[Record] = []
-    yield lambda _, records: results.extend(_result(record, truth) for record in records)
+    yield lambda _, records: results.extend(
+        _result(record, truth.categories[class_name(record.get("label"))], truth) for record in records
+    )
     part.write_text(json.dumps(results, ensure_ascii=False), encoding="utf-8", newline="\n")

@@ -56,6 +56,7 @@ from vehicle_detection.tables import (
     parse_cells,
     parse_number,
 )
+from vehicle_detection.tracking import UNKNOWN_LABEL
 
 FORMATS = {
     ".csv": "csv",
@@ -195,7 +196,7 @@ def _kitti_record(where: str, words: list[str], classes: Collection[str] | None)
     occluded = min(max(int(parse_number(words[2], "occluded", where)), 0), _HIDDEN)
     unscored = occluded >= _HIDDEN or truncated > _MAX_TRUNCATED or corners[2] - corners[0] < _MIN_WIDTH
     ignore = not wanted or (unscored and score is None)
-    return record | {"occluded": occluded, "truncated": truncated, "ignore": ignore}
+    return record | {"occluded": occluded, "truncated": truncated, "ignore": ignore, "label": name}
 
 
 def _read_mot(source: Path, classes: Collection[str] | None) -> FileRows:
@@ -273,7 +274,8 @@ def _read_mot_zip(source: Path, classes: Collection[str] | None) -> FileRows:
                     f"{where}: class must be a whole number from 1 to {len(labels)}, as in gt/labels.txt, "
                     f"got {number}"
                 )
-            if labels[int(index) - 1] not in wanted:
+            record["label"] = labels[int(index) - 1]
+            if record["label"] not in wanted:
                 continue
         rows.append((where, record))
     return rows_of_records(rows)
@@ -359,7 +361,7 @@ def read_labels(
         without ``.txt``, COCO frames the images' ``file_name``. Frames of MOT files and of CVAT's archives
         count from 1, as do the pixels of MOT files, but not those of the archives; all are returned from 0.
         YOLO frames are the files' names without ``.txt``, or numbers if all have six digits, or with `images`
-        the images' file names; a confidence becomes its log-odds.
+        the images' file names; a confidence becomes its log-odds. ``label`` is the class that a file names.
 
     Raises
     ------
@@ -407,14 +409,18 @@ def read_labels(
         found, shape = read_yolo(source, chosen, shape, pictures), None  # its boxes are clipped
     else:
         found = _READERS[kind](source, chosen)
-    return _table_of(source, found, chosen, shape)
+    return _table_of(source, kind, found, chosen, shape)
 
 
 def _table_of(
-    source: Path, found: FileRows, classes: Collection[str] | None, shape: tuple[int, ...] | None
+    source: Path, kind: str, found: FileRows, classes: Collection[str] | None, shape: tuple[int, ...] | None
 ) -> TrackTable:
     """Check the rows of any format, clip their boxes to `shape`, and return them as a table."""
+    # Tables are filtered by class here; other formats have been, and may have ignored boxes of other classes.
+    labels = None if kind in ("csv", "jsonl", "parquet") else found.cells.pop("label", None)
     columns, places = parse_cells(found.cells, source, found.places, classes)
+    if labels is not None and {*labels} - {None, UNKNOWN_LABEL}:
+        columns["label"] = [label or UNKNOWN_LABEL for label in labels]
     boxes, labelled = columns["boxes"], "score" not in columns
     # A prediction clipped at the border may have no area; a label without area is a mistake.
     sides = boxes[:, 2:] - boxes[:, :2]

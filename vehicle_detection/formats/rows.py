@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 from vehicle_detection._common import Limit, read_regular_file, shorten
 from vehicle_detection.datasets import is_image
 from vehicle_detection.errors import DatasetError
-from vehicle_detection.tables import BOX_COLUMNS, FrameKey, frame_order
+from vehicle_detection.tables import BOX_COLUMNS, VEHICLE_CLASSES, FrameKey, frame_order
+from vehicle_detection.tracking import UNKNOWN_LABEL
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -35,6 +36,37 @@ def rows_of_records(rows: Iterable[tuple[str, Record]], frames: Sequence[FrameKe
     places, records = zip(*listed) if (listed := list(rows)) else ((), ())
     names = dict.fromkeys(name for record in records for name in record) or BOX_COLUMNS[:-1]
     return FileRows(list(places), {name: [record.get(name) for record in records] for name in names}, frames)
+
+
+class ClassNumbers:
+    """Numbers from 0 of the classes in a file: the usual ones, which agree between files, then others."""
+
+    def __init__(self) -> None:
+        self._numbers = {name: number for number, name in enumerate((UNKNOWN_LABEL, *VEHICLE_CLASSES[:-1]))}
+        self.used = set[str]()
+
+    def name(self, record: Record) -> str:
+        """Return the class of a row, with a warning if it is new and not read by default."""
+        name = class_name(record.get("label"))
+        if name not in self._numbers and not record.get("ignore"):
+            _LOGGER.warning("boxes of class %r are read back only if classes= names it", name)
+        self.used.add(name)
+        self._numbers.setdefault(name, len(self._numbers))
+        return name
+
+    def number(self, record: Record) -> int:
+        """Return the number of the class of a row."""
+        return self._numbers[self.name(record)]
+
+    @property
+    def names(self) -> list[str]:
+        """Name of each number; one if no row has a known class."""
+        return list(self._numbers) if self.used - {UNKNOWN_LABEL} else [UNKNOWN_LABEL]
+
+
+def class_name(label: str | None) -> str:
+    """Return a class as it is read back: in lower case, on one line."""
+    return " ".join((label or UNKNOWN_LABEL).lower().split())
 
 
 def read_lines(file: Path, text: str | None = None) -> Iterator[tuple[str, str]]:

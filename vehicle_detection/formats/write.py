@@ -39,7 +39,7 @@ from vehicle_detection.formats.coco import (
     without_noise,
 )
 from vehicle_detection.formats.read import FOLDER_FORMATS, FORMATS
-from vehicle_detection.formats.rows import FRAME_NUMBER, Record, without_suffix
+from vehicle_detection.formats.rows import FRAME_NUMBER, ClassNumbers, Record, without_suffix
 from vehicle_detection.tables import BOX_COLUMNS, CORNERS, NO_TRACK, TRACK_COLUMNS, FrameKey, TrackTable
 from vehicle_detection.tracking import TRACK_VALUES, UNKNOWN_LABEL, is_result, shown_tracks
 
@@ -171,16 +171,18 @@ def _open_mot(part: Path, target: _Target) -> Iterator[Write]:
 @contextlib.contextmanager
 def _open_mot_zip(part: Path, target: _Target) -> Iterator[Write]:
     """Archive of ground truth as CVAT writes it: pixels count from 0, and class 1 is the first label."""
+    numbers = ClassNumbers()
     with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
         with (
             archive.open("gt/gt.txt", "w") as binary,
             io.TextIOWrapper(binary, "utf-8", newline="\n") as text,
         ):
             yield lambda _, records: text.writelines(
-                _mot_line(record, first_pixel=0, vehicle_class=1, scores=False) for record in records
+                _mot_line(record, first_pixel=0, vehicle_class=numbers.number(record) + 1, scores=False)
+                for record in records
             )
         # Without the time of day, as the other member: the same tracks give the same archive.
-        archive.writestr(zipfile.ZipInfo("gt/labels.txt"), "vehicle\n")
+        archive.writestr(zipfile.ZipInfo("gt/labels.txt"), "".join(f"{name}\n" for name in numbers.names))
 
 
 def _folder_writer(
@@ -207,32 +209,40 @@ def _open_yolo(part: Path, target: _Target) -> Iterator[Write]:
     """Lines of class, center and size as fractions of the frame, confidence and track; labels have five."""
     if target.shape is None:
         raise InvalidInputError("shape must be (height, width) of the frames for YOLO, got None; pass it")
+    import yaml
+
     height, width = target.shape[:2]
+    numbers = ClassNumbers()
 
     def line(record: Record) -> str:
         x1, y1, x2, y2 = (record[name] for name in CORNERS)
-        numbers = [(x1 + x2) / 2 / width, (y1 + y2) / 2 / height, (x2 - x1) / width, (y2 - y1) / height]
+        values = [(x1 + x2) / 2 / width, (y1 + y2) / 2 / height, (x2 - x1) / width, (y2 - y1) / height]
         track: list[str] = []
         if record.get("score") is not None:
             # math.exp overflows beyond 709.
             known = record.get("confidence")
-            numbers.append(1 / (1 + math.exp(min(-record["score"], 700))) if known is None else known)
+            values.append(1 / (1 + math.exp(min(-record["score"], 700))) if known is None else known)
             track = [] if record["track_id"] in (None, NO_TRACK) else [str(record["track_id"])]
-        return " ".join(["0", *(f"{number:.6f}" for number in numbers), *track]) + "\n"
+        return " ".join([str(numbers.number(record)), *(f"{value:.6f}" for value in values), *track]) + "\n"
 
     (part / "labels").mkdir()
-    (part / "data.yaml").write_text("names:\n  0: vehicle\n", encoding="utf-8", newline="\n")
     yield _folder_writer(
         part / "labels", lambda key: Path(key).stem if isinstance(key, str) else f"{key:06d}", line, "YOLO"
     )
+    names = yaml.safe_dump({"names": dict(enumerate(numbers.names))}, allow_unicode=True, sort_keys=False)
+    (part / "data.yaml").write_text(names, encoding="utf-8", newline="\n")
 
 
 @contextlib.contextmanager
 def _open_kitti(part: Path, target: _Target) -> Iterator[Write]:
     """``label_2`` files, in which angle, size and place in 3D are unknown."""
+    classes = ClassNumbers()
 
     def line(record: Record) -> str:
-        name = "DontCare" if record.get("ignore", False) else "Car"
+        # KITTI has no type for all vehicles, and no spaces in types.
+        label = classes.name(record)
+        name = "Car" if label == UNKNOWN_LABEL else label.capitalize().replace(" ", "_")
+        name = "DontCare" if record.get("ignore", False) else name
         words = [name, record.get("truncated", 0.0), record.get("occluded", 0), -10]
         words += [*(record[side] for side in CORNERS), "-1 -1 -1 -1000 -1000 -1000 -10"]
         words += [] if record.get("score") is None else [record["score"]]
@@ -248,7 +258,7 @@ _WRITERS: dict[str, Callable[[Path, _Target], contextlib.AbstractContextManager[
     "mot": _open_mot,
     "mot_zip": _open_mot_zip,
     "coco": lambda part, target: open_coco(part, target.shape, target.truth),
-    "coco_results": lambda part, target: open_coco_results(part, target.truth),
+    "coco_results": lambda part, target: open_coco_results(part, target.truth or Truth({}, {})),
     "kitti": _open_kitti,
     "yolo": _open_yolo,
 }
@@ -389,9 +399,9 @@ def write_tracks(
     -----
     ``frame`` counts from 0, the first processed frame; boxes are half-open pixels with two decimals.
     Unknown values are empty in CSV and null elsewhere. The score is the log-odds above the threshold, the
-    confidence a calibrated probability; speeds are relative to the camera. The label is the class,
-    ``vehicle`` if the model does not tell kinds apart. Detections of images have the columns up to ``score``,
-    ``confidence`` and ``label``. The archive for CVAT holds labels to correct, without scores.
+    confidence a calibrated probability; speeds are relative to the camera. The label is the class, also
+    of boxes in COCO, YOLO and CVAT, ``vehicle`` if the model does not tell kinds apart. Detections of images
+    have the columns up to ``score``, ``confidence`` and ``label``. The archive for CVAT has no scores.
 
     Examples
     --------

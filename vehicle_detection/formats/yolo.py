@@ -75,7 +75,7 @@ def read_yolo(source: Path, classes: Collection[str] | None, shape: Any, images:
             numbers.add(name)
             sixth.update(words[5:6] if len(words) == 6 else ("",))
             if (not names and classes is None) or names.get(name, name) in wanted:
-                rows.append((where, {"frame": key, **record}))
+                rows.append((where, {"frame": key, "label": names.get(name), **record}))
     if sixth and sixth <= {"0", "1"}:
         raise DatasetError(f"{source} has {_TRACKS_ALONE}")
     if not names and classes is not None and numbers:
