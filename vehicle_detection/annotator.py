@@ -29,6 +29,7 @@ from vehicle_detection._common import (
     choice,
     describe,
     integer,
+    invalid,
     is_listing,
 )
 from vehicle_detection.boxes import Detections
@@ -71,9 +72,7 @@ LABEL_FIELDS = ("id", "score", "distance", "speed", "std")
 
 def _check_labels(value: Any, name: str) -> tuple[str, ...]:
     if not isinstance(value, Collection) or getattr(value, "ndim", 1) == 0:
-        raise InvalidInputError(
-            f"{name} must be a list of fields, got {describe(value)}; pass some of {LABEL_FIELDS}"
-        )
+        raise invalid(name, "be a list of fields", value, f"pass some of {LABEL_FIELDS}")
     fields = (value,) if isinstance(value, str) else tuple(value)
     for field in fields:
         check_choice(field, name, LABEL_FIELDS)
@@ -534,9 +533,7 @@ def _check_tracks(tracks: object) -> list[Track]:
     """Return tracks as a list."""
     listed: list[Any] = list(tracks) if is_listing(tracks) else [None]
     if not all(isinstance(track, Track) for track in listed):
-        raise InvalidInputError(
-            f"tracks must be Track objects, got {describe(tracks)}; pass what update returns"
-        )
+        raise invalid("tracks", "be Track objects", tracks, "pass what update returns")
     return listed
 
 
@@ -562,9 +559,7 @@ def draw_diagnostics(
     checked = check_image(frame, "frame")
     height, width = (side // 2 for side in checked.shape[:2])
     if min(height, width) < 2:
-        raise InvalidInputError(
-            f"frame must be at least 4x4 pixels, got {describe(frame)}; pass a larger image"
-        )
+        raise invalid("frame", "be at least 4x4 pixels", frame, "pass a larger image")
     # Draw at the panels' size, so that lines and text stay sharp.
     small = np.asarray(cv2.resize(checked, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     scale = np.array([width, height, width, height]) / np.array(checked.shape[:2] * 2)[[1, 0, 1, 0]]

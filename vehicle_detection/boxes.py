@@ -26,6 +26,7 @@ from vehicle_detection._common import (
     check_sequence,
     check_shape,
     describe,
+    invalid,
     number,
     pluralize,
 )
@@ -107,9 +108,7 @@ class Detections:
         if self.labels is not None:
             labels = check_sequence(self.labels, "labels", "names of the classes of boxes")
             if len(labels) != len(boxes) or not all(isinstance(label, str) for label in labels):
-                raise InvalidInputError(
-                    f"labels must be a name for each of the {len(boxes)} boxes, got {describe(self.labels)}"
-                )
+                raise invalid("labels", f"be a name for each of the {len(boxes)} boxes", self.labels)
             vars(self)["labels"] = np.array(labels, np.str_)
         if self.class_ids is not None:
             numbers = _score_column(self.class_ids, "class_ids", len(boxes))

@@ -37,6 +37,7 @@ from vehicle_detection._common import (
     checked_field,
     describe,
     flag,
+    invalid,
     number,
     read_regular_file,
     suggest_keywords,
@@ -401,10 +402,7 @@ def open_camera(
     if not isinstance(camera, Camera):
         check_type(camera, "camera", (Camera, str, os.PathLike), "omit it for the default")
         if not os.path.isfile(camera):  # type: ignore[arg-type]
-            raise InvalidInputError(
-                f"camera must be a Camera, a file or one of {', '.join(LENSES)}, got {describe(camera)}; "
-                "omit it"
-            )
+            raise invalid("camera", f"be a Camera, a file or one of {', '.join(LENSES)}", camera, "omit it")
         camera = read_camera(camera)  # type: ignore[arg-type]
         if height_m is not None:
             height = check_number(height_m, "height_m", above=0, high=100)
@@ -486,9 +484,7 @@ def _read_values(path: Path) -> dict[str, Any]:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else error
         raise InvalidInputError(f"camera file {path} is not {kind}: {reason}; see read_camera") from None
     if not isinstance(values, dict):
-        raise InvalidInputError(
-            f"camera file {path} must be an object with the names of read_camera; got {describe(values)}"
-        )
+        raise invalid(f"camera file {path}", "be an object with the names of read_camera", values)
     return values
 
 

@@ -25,6 +25,7 @@ from vehicle_detection._common import (
     check_path,
     check_type,
     describe,
+    invalid,
     pluralize,
     suggest_keywords,
 )
@@ -103,9 +104,7 @@ def load_model(
     check_choice(device, "device", ("cpu", "cuda"))
     for name, value in ("classes", classes), ("device", None if device == "cpu" else device):
         if value is not None:
-            raise InvalidInputError(
-                f"{name} must be omitted for {str(path)!r}, which is no network; got {describe(value)}"
-            )
+            raise invalid(name, f"be omitted for {str(path)!r}, which is no network", value)
     return load_classifier(path)
 
 
@@ -113,9 +112,7 @@ def _check_model(model: Any) -> Model:
     if isinstance(model, (str, os.PathLike)):
         return load_model(model)
     if callable(model) and not isinstance(model, type):
-        raise InvalidInputError(
-            f"model must not be a function, got {describe(model)}; pass it to detector_from"
-        )
+        raise invalid("model", "not be a function", model, "pass it to detector_from")
     if hasattr(model, "predict") and not isinstance(model, VehicleClassifier):
         argument = "pipeline" if hasattr(model, "steps") else "(classifier, scaler)"
         raise InvalidInputError(
@@ -123,9 +120,7 @@ def _check_model(model: Any) -> Model:
             f"VehicleClassifier.from_pipeline({argument}, params), or use HeatmapDetector"
         )
     if isinstance(model, type) or not hasattr(model, "open_search"):
-        raise InvalidInputError(
-            f"model must be a name, a model file, or what load_model returns; got {describe(model)}; omit it"
-        )
+        raise invalid("model", "be a name, a model file, or what load_model returns", model, "omit it")
     return cast(Model, model)
 
 

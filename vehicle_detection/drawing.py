@@ -26,6 +26,7 @@ from vehicle_detection._common import (
     check_integer,
     check_type,
     describe,
+    invalid,
 )
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
@@ -568,9 +569,7 @@ def heat_image(heat: NDArray[Any]) -> Image:
     """Color an ``(h, w)`` heat map from black (0) to yellow (its maximum), as ``(h, w, 3)`` uint8 RGB."""
     values = check_array(heat, "heat")
     if values.ndim != 2 or not values.size or values.dtype.kind not in "iufb":
-        raise InvalidInputError(
-            f"heat must be an (h, w) array of numbers, got {describe(heat)}; pass a heat map"
-        )
+        raise invalid("heat", "be an (h, w) array of numbers", heat, "pass a heat map")
     values = values.astype(np.float32)
     if not np.isfinite(values).all():
         raise InvalidInputError("heat must be finite, got NaN or infinity; build it with add_heat")

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Checked, check_bool, check_type, describe, number
+from vehicle_detection._common import Checked, check_bool, check_type, describe, invalid, number
 from vehicle_detection.boxes import (
     Detections,
     Platt,
@@ -70,9 +70,8 @@ class FunctionModel:
 
     def __post_init__(self) -> None:
         if not callable(self.function):
-            raise InvalidInputError(
-                f"function must be a function of an image, got {describe(self.function)}; it returns boxes "
-                "and scores"
+            raise invalid(
+                "function", "be a function of an image", self.function, "it returns boxes and scores"
             )
         vars(self)["thread_safe"] = check_bool(self.thread_safe, "thread_safe")
         check_type(self.name, "name", str | None, "omit it for the function's name")

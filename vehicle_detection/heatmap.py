@@ -23,8 +23,8 @@ from vehicle_detection._common import (
     check_shape,
     check_type,
     choice,
-    describe,
     integer,
+    invalid,
     number,
 )
 from vehicle_detection.boxes import Detections, clip_boxes
@@ -118,9 +118,7 @@ def heat_range(search: Any, params: HeatParams) -> HeatRange:
 def _check_heat(heatmap: object, *, in_place: bool = False) -> NDArray[Any]:
     array = heatmap if isinstance(heatmap, np.ndarray) else np.array(None)
     if array.ndim != 2 or not array.size or array.dtype.kind not in "iuf":
-        raise InvalidInputError(
-            f"heatmap must be an (H, W) number array, got {describe(heatmap)}; {_START_WITH_ZEROS}"
-        )
+        raise invalid("heatmap", "be an (H, W) number array", heatmap, f"{_START_WITH_ZEROS}")
     if in_place and not array.flags.writeable:
         raise InvalidInputError(
             "heatmap must be writable, because it is changed in place; got a read-only array, pass a copy"

@@ -22,9 +22,9 @@ from vehicle_detection._common import (
     atomic_write,
     check_image,
     check_path,
-    describe,
     download_bytes,
     hide_credentials,
+    invalid,
     is_hidden,
     is_url,
     local_path,
@@ -146,9 +146,7 @@ def read_image(path: str | os.PathLike[str] | bytes) -> NDArray[np.uint8]:
     if isinstance(path, bytes):
         return decode_image(path, "the bytes")
     if isinstance(path, (bytearray, memoryview)) or hasattr(path, "getvalue"):
-        raise InvalidInputError(
-            f"path must be a file name or bytes, got {describe(path)}; pass bytes(...) or stream.getvalue()"
-        )
+        raise invalid("path", "be a file name or bytes", path, "pass bytes(...) or stream.getvalue()")
     if isinstance(path, str) and is_url(path := local_path(path)):
         return decode_image(download_bytes(path, Limit.IMAGE_BYTES), f"image {hide_credentials(path)}")
     name = f"image file {(file := check_path(path))}"

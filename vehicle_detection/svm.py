@@ -19,6 +19,7 @@ from vehicle_detection._common import (
     check_sequence,
     check_type,
     describe,
+    invalid,
     pluralize,
     read_model,
     store_number,
@@ -63,10 +64,7 @@ class Template:
         for name in ("mean", "scale", "coef"):
             column = np.array(getattr(self, name), np.float64)
             if column.ndim != 1 or column.shape != np.shape(self.mean):
-                raise InvalidInputError(
-                    f"{name} must be a vector of the features' length {np.shape(self.mean)}; "
-                    f"got {describe(column)}"
-                )
+                raise invalid(name, f"be a vector of the features' length {np.shape(self.mean)}", column)
             if not np.isfinite(column).all():
                 raise InvalidInputError(f"{name} must be finite, got NaN or infinity; train again")
             column.setflags(write=False)
@@ -156,10 +154,7 @@ class VehicleClassifier:
         """Accuracy, 0 to 1, for ``(N,)`` labels `y`, 1 for a vehicle; `X` as in `decision_function`."""
         labels, predicted = check_array(y, "y"), self.predict(X)
         if labels.shape != predicted.shape or not labels.size:
-            raise InvalidInputError(
-                f"y must hold one label for each of {len(predicted)} rows (at least one); "
-                f"got {describe(labels)}"
-            )
+            raise invalid("y", f"hold one label for each of {len(predicted)} rows (at least one)", labels)
         return float(np.mean(predicted == labels))
 
     def _features_of(self, X: ArrayLike) -> NDArray[Any]:
@@ -168,10 +163,7 @@ class VehicleClassifier:
         if array.ndim == 4:
             return extract_features(check_patches(array, PATCH_SIZE, "X"), self.params)
         if array.ndim != 2 or array.shape[1] != self.params.length or array.dtype.kind not in "iuf":
-            raise InvalidInputError(
-                f"X must be (N, {self.params.length}) features or (N, 64, 64, 3) patches; "
-                f"got {describe(array)}"
-            )
+            raise invalid("X", f"be (N, {self.params.length}) features or (N, 64, 64, 3) patches", array)
         if not np.isfinite(array).all():
             raise InvalidInputError("X must be finite, got NaN or infinity")
         return array
@@ -219,9 +211,7 @@ class VehicleClassifier:
         if metadata is not None:
             check_type(metadata, "metadata", Mapping, "pass a dictionary")
         if not isinstance(params, FeatureParams):
-            raise InvalidInputError(
-                f"params must be the FeatureParams of the pipeline's features; got {describe(params)}"
-            )
+            raise invalid("params", "be the FeatureParams of the pipeline's features", params)
         # The gains change the weights only, not the features.
         if known and replace(params, hist_gain=known.hist_gain, coarse_gain=known.coarse_gain) != known:
             raise InvalidInputError(

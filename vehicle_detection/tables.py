@@ -20,6 +20,7 @@ from vehicle_detection._common import (
     check_sequence,
     check_type,
     describe,
+    invalid,
     is_listing,
     natural_key,
     pluralize,
@@ -210,9 +211,7 @@ class TrackTable:
         table = cls()
         for result in results:
             if not is_result(result):
-                raise InvalidInputError(
-                    f"results must be FrameResult objects, got {describe(result)}; use read_labels for files"
-                )
+                raise invalid("results", "be FrameResult objects", result, "use read_labels for files")
             table.append(result)
         return table
 
@@ -452,18 +451,14 @@ def _check_column(values: ArrayLike | None, name: str, rows: int) -> NDArray[Any
     if name == "label":
         labels = [UNKNOWN_LABEL] * rows if values is None else np.asarray(values).tolist()
         if len(labels) != rows or not all(isinstance(label, str) for label in labels):
-            raise InvalidInputError(
-                f"label must be a name for each of the {rows} boxes, got {describe(values)}"
-            )
+            raise invalid("label", f"be a name for each of the {rows} boxes", values)
         return np.array(labels, object)
     given = filled if values is None else check_array(values, name)
     if given.size == 0:
         given = given.reshape(-1).astype(filled.dtype)
     kinds = {"b": "b", "i": "iub", "f": "iufb"}[filled.dtype.kind]
     if given.shape != (rows,) or given.dtype.kind not in kinds:
-        raise InvalidInputError(
-            f"{name} must be one value for each of the {rows} boxes, got {describe(given)}"
-        )
+        raise invalid(name, f"be one value for each of the {rows} boxes", given)
     outside = (given < column.low) | (given > column.high)
     if outside.any():
         raise InvalidInputError(f"{name} must be {column.expected}; got {given[outside][0]}")

@@ -17,7 +17,7 @@ from vehicle_detection import video
 from vehicle_detection.annotator import DrawParams
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.cli.options import parse_time
-from vehicle_detection.cli.video_outputs import read_speed
+from vehicle_detection.cli.video import read_speed
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes import render_drive
 from vehicle_detection.tracking import HorizonEstimate

@@ -22,6 +22,7 @@ from vehicle_detection._common.checks import (
     describe,
     flag,
     integer,
+    invalid,
     is_listing,
     number,
     shorten,
@@ -37,7 +38,7 @@ from vehicle_detection._common.files import (
     temporary_folder,
     write_text,
 )
-from vehicle_detection._common.keywords import suggest_keywords
+from vehicle_detection._common.keywords import suggest_keywords, synonyms
 from vehicle_detection._common.limits import Limit, check_environment, check_regular_file, read_regular_file
 from vehicle_detection._common.model_file import FORMAT_VERSION, model_terms, read_model, write_model
 from vehicle_detection._common.parquet import import_pyarrow, open_parquet

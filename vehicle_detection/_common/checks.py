@@ -54,6 +54,11 @@ def shorten(text: str, length: int = 80) -> str:
     return text if len(text) <= length else text[: length - 3] + "..."
 
 
+def invalid(name: str, must: str, got: object, remedy: str = "") -> InvalidInputError:
+    """Error of an argument: its name, what it must be or have, what came, and what to do."""
+    return InvalidInputError(f"{name} must {must}, got {describe(got)}{'; ' * bool(remedy)}{remedy}")
+
+
 def check_type(value: object, name: str, kind: Any, remedy: str) -> None:
     """Raise unless `value` is an instance of `kind`: a class, a union such as ``Camera | None``, a tuple."""
     if not isinstance(value, kind):
@@ -95,9 +100,7 @@ def check_image(image: object, name: str = "image") -> NDArray[np.uint8]:
             remedy = "pass one image after the other"
         elif isinstance(image, bytes):
             remedy = "decode it with vehicle_detection.read_image(data)"
-        raise InvalidInputError(
-            f"{name} must be an (H, W, 3) uint8 RGB array, got {describe(image)}; {remedy}"
-        )
+        raise invalid(name, "be an (H, W, 3) uint8 RGB array", image, remedy)
     if image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 1):
         remedy = "convert a grayscale image with cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)"
     elif image.ndim == 3 and image.shape[2] == 4:
@@ -152,9 +155,8 @@ def check_patches(patches: object, size: int, name: str = "patches") -> NDArray[
             remedy = f"pass a single patch as {name}[None]"
         elif patches.ndim in (3, 4):
             remedy = f"resize each image with cv2.resize(image, ({size}, {size}))"
-    raise InvalidInputError(
-        f"{name} must be an (N, {size}, {size}, 3) uint8 RGB array or a list of such images, "
-        f"got {describe(patches)}; {remedy}"
+    raise invalid(
+        name, f"be an (N, {size}, {size}, 3) uint8 RGB array or a list of such images", patches, remedy
     )
 
 
@@ -174,9 +176,7 @@ def check_array(values: object, name: str) -> NDArray[Any]:
 def check_shape(shape: object) -> tuple[int, int]:
     """Return height and width of ``image.shape``, two or more positive integers."""
     if not isinstance(shape, (tuple, list)) or len(shape) < 2:
-        raise InvalidInputError(
-            f"shape must be (height, width, ...), got {describe(shape)}; pass image.shape"
-        )
+        raise invalid("shape", "be (height, width, ...)", shape, "pass image.shape")
     return check_integer(shape[0], "shape[0]", low=1), check_integer(shape[1], "shape[1]", low=1)
 
 
@@ -203,9 +203,7 @@ def is_listing(values: object) -> TypeGuard[Iterable[Any]]:
 def check_sequence(values: object, name: str, of: str) -> tuple[Any, ...]:
     """Return the items of a sequence or another iterable, but not the characters of a text."""
     if not is_listing(values):
-        raise InvalidInputError(
-            f"{name} must be a sequence of {of}, got {describe(values)}; wrap it in a list"
-        )
+        raise invalid(name, f"be a sequence of {of}", values, "wrap it in a list")
     return tuple(values)
 
 

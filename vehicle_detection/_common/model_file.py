@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common.checks import check_path, describe
+from vehicle_detection._common.checks import check_path, invalid
 from vehicle_detection._common.files import atomic_write
 from vehicle_detection._common.limits import Limit, read_regular_file
 from vehicle_detection.errors import InvalidInputError, ModelFileError
@@ -91,9 +91,7 @@ def checksum(header: Mapping[str, str], tensors: Tensors) -> str:
 def read_model(path: str | os.PathLike[str], kind: str) -> ModelData:
     """Read and verify a model file, or a shipped model by its name."""
     if not isinstance(path, (str, os.PathLike)):
-        raise InvalidInputError(
-            f"path must be a model file or one of {', '.join(map(repr, SHIPPED))}; got {describe(path)}"
-        )
+        raise invalid("path", f"be a model file or one of {', '.join(map(repr, SHIPPED))}", path)
     if str(path) == "default":
         raise ModelFileError(
             "the shipped model 'default' is a network, no classifier of patches; load it with load_model"

@@ -21,8 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common.checks import check_integer, describe
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection._common.checks import check_integer, invalid
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -108,9 +107,7 @@ def resolve_jobs(jobs: int | None = None) -> int:
         return available_cores()
     # The length first: Python refuses to convert thousands of digits.
     if not text.isdecimal() or len(text) > 9 or not 1 <= int(text) <= _MAX_JOBS:
-        raise InvalidInputError(
-            f"{JOBS_VARIABLE} must be a number of threads from 1 to {_MAX_JOBS}; got {describe(text)}"
-        )
+        raise invalid(JOBS_VARIABLE, f"be a number of threads from 1 to {_MAX_JOBS}", text)
     return int(text)
 
 

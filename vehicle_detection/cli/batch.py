@@ -14,6 +14,7 @@ import typer
 from typer import Argument
 
 import vehicle_detection as vd
+from vehicle_detection.cli import common
 from vehicle_detection.cli import options as shared
 from vehicle_detection.cli.options import flag, option, parse_classes, takes
 from vehicle_detection.cli.output import UNKNOWN_LENS, option_names, output_folder, print_error, print_line
@@ -78,11 +79,9 @@ class BatchOptions:
 @takes(BatchOptions)
 def batch(options: BatchOptions) -> None:
     """Track the vehicles of many videos in parallel; run again to do what is missing or changed."""
-    from vehicle_detection._common import check_suffix, hide_credentials
-
     output, summary = options.output, options.summary
     if summary is not None:
-        check_suffix(summary, "--summary", (".csv",))
+        common.check_suffix(summary, "--summary", (".csv",))
         if options.dry_run:
             raise InvalidInputError("--dry-run has no results for --summary; omit one of them")
     if options.status:
@@ -102,23 +101,21 @@ def batch(options: BatchOptions) -> None:
         if done.done and options.camera is None and options.fov is None:
             print_error(UNKNOWN_LENS)
         print_line(str(done))
-        print_line(f"wrote {hide_credentials(output)}" + (f", {summary}" if summary else ""))
+        print_line(f"wrote {common.hide_credentials(output)}" + (f", {summary}" if summary else ""))
     if done.errors:  # the machine's fault: a job that is started again does the rest
         raise typer.Exit(1)
 
 
 def _run(options: BatchOptions, sources: list[str]) -> Any:
     """Process the trips of the sources, on a Dask cluster if one is named."""
-    from vehicle_detection._common import is_url, local_path
-
     with contextlib.ExitStack() as stack:
         executor = None
         if options.dask is not None and not options.dry_run:
             executor, dashboard = stack.enter_context(vd.drive.open_dask(options.dask, options.jobs))
             if not options.quiet:
                 print_line(f"dashboard {dashboard}")
-        folder = local_path(options.output)
-        if folder and not options.dry_run and not is_url(folder):
+        folder = common.local_path(options.output)
+        if folder and not options.dry_run and not common.is_url(folder):
             stack.enter_context(output_folder(Path(folder), "--output"))
         shown = not options.quiet
         return vd.run_batch(
@@ -135,35 +132,31 @@ def _run(options: BatchOptions, sources: list[str]) -> Any:
 
 def _print_record(record: Mapping[str, Any], *, done: bool) -> None:
     """Warn of a trip without results; with `done` also print others, for logs, which show no progress bar."""
-    from vehicle_detection._common import encodable, hide_credentials, pluralize
-
     source = record["sources"][0]["uri"]
     # A log that cannot be written does not end the batch.
     with contextlib.suppress(OSError, ValueError):
         if record["status"] != "done":
             print_error(f"warning: {vd.drive.with_source(source, record['message'])}")
         elif done:
-            name = encodable(hide_credentials(source))
-            print_error(f"done: {name}, {pluralize(record['frames'], 'frame')}")
+            name = common.encodable(common.hide_credentials(source))
+            print_error(f"done: {name}, {common.pluralize(record['frames'], 'frame')}")
 
 
 def _print_trip(trip: Mapping[str, Any]) -> None:
     """Print a trip that would be processed: its start, camera and files."""
-    from vehicle_detection._common import encodable, hide_credentials, pluralize
-
     start = (trip["start"] or "unknown start").replace("T", " ")
-    replaced = f", replaces {pluralize(len(trip['replaces']), 'earlier result')}" if trip["replaces"] else ""
-    first = encodable(hide_credentials(trip["files"][0]))
-    print_line(f"{start}  {trip['camera']}  {pluralize(len(trip['files']), 'file')} from {first}{replaced}")
+    files = common.pluralize(len(trip["files"]), "file")
+    first = common.encodable(common.hide_credentials(trip["files"][0]))
+    results = common.pluralize(len(trip["replaces"]), "earlier result")
+    replaced = f", replaces {results}" if trip["replaces"] else ""
+    print_line(f"{start}  {trip['camera']}  {files} from {first}{replaced}")
 
 
 def _write_summary(output: str, summary: Path | None) -> None:
     """Write the table of all trips of a batch."""
     if summary is not None:
-        from vehicle_detection._common import atomic_write, spreadsheet_text
-
         table = vd.drive.batch_summary(output).map(
-            lambda cell: spreadsheet_text(cell) if isinstance(cell, str) else cell
+            lambda cell: common.spreadsheet_text(cell) if isinstance(cell, str) else cell
         )
-        with atomic_write(summary, "--summary") as part:
+        with common.atomic_write(summary, "--summary") as part:
             table.to_csv(part, index=False)

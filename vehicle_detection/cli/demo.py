@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import vehicle_detection as vd
+from vehicle_detection.cli import common
 from vehicle_detection.cli.options import flag, option
 from vehicle_detection.cli.output import option_names, output_folder, print_facts, print_line
 from vehicle_detection.errors import OutputError, VehicleDetectionError, VideoError
@@ -67,9 +68,7 @@ def _run(
     """Draw a drive, annotate and score it, oncoming vehicles too; an error leaves no file in the folder."""
     import numpy as np
 
-    from vehicle_detection._common import temporary_folder
-
-    with temporary_folder(folder, "demo") as temporary, _named_in(folder, temporary):
+    with common.temporary_folder(folder, "demo") as temporary, _named_in(folder, temporary):
         clip, annotated, tracks, labels, sheet = (temporary / name for name in FILES)
         page = vd.ReportWriter(temporary / REPORT, video=annotated, source=clip, detector=detector)
         draw_clip(drive, clip, labels, progress=True)
@@ -101,7 +100,6 @@ def _named_in(folder: Path, temporary: Path) -> Iterator[None]:
 
 def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False) -> None:
     """Write the frames of a drive as a video, and their ground truth as a table, with oncoming vehicles."""
-    from vehicle_detection._common import progress_bar
     from vehicle_detection.scenes import write_labels
 
     height, width = drive.shape
@@ -116,7 +114,7 @@ def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False)
     try:
         with (
             FFMPEG_VideoWriter(str(clip), (width, height), drive.fps, preset="veryfast") as writer,
-            progress_bar(progress, len(drive), unit="frame", desc="drawing", interactive_only=True) as bar,
+            common.progress_bar(progress, len(drive), unit="frame", interactive_only=True) as bar,
         ):
             for scene in drive:
                 truth.append(scored_truth(scene.truth))

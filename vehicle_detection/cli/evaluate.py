@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from typer import Argument
 
 import vehicle_detection as vd
+from vehicle_detection.cli import common
 from vehicle_detection.cli.options import flag, option
 from vehicle_detection.cli.output import check_targets, print_error, print_line
 from vehicle_detection.errors import InvalidInputError
@@ -47,7 +48,6 @@ def evaluate(
 
     import numpy as np
 
-    from vehicle_detection._common import write_text
     from vehicle_detection.evaluation import evaluate_distances
     from vehicle_detection.tables import NO_TRACK
 
@@ -82,7 +82,8 @@ def evaluate(
             noun = "box has" if count == 1 else "boxes have"
             print_error(f"note: the tracks are not scored: {count} {noun} no track in {file}")
     if json is not None:
-        write_text(json, dumps({name: each.to_dict() for name, each in scores.items()}, indent=2) + "\n")
+        plain = {name: each.to_dict() for name, each in scores.items()}
+        common.write_text(json, dumps(plain, indent=2) + "\n")
 
 
 def _note_frames_of_one_file(
@@ -118,14 +119,13 @@ def _parse_frames(text: str, keys: Sequence[FrameKey]) -> list[FrameKey]:
         for first, last, step in (found.groups() for found in spans if found):
             chosen += range(int(first), int(last or first) + 1, int(step or 1))
     else:
-        from vehicle_detection._common import Limit, check_path, read_regular_file
-
         kind = "numbers such as 0,6,12 or 0-299 (0-299:6 for every 6th), or a file with a frame in each line"
-        file = check_path(text, "--frames", kind=kind)
+        file = common.check_path(text, "--frames", kind=kind)
         if not file.exists():
             raise InvalidInputError(f"--frames must be {kind}, got {text!r}")
-        data = read_regular_file(file, f"--frames {text}", Limit.TEXT_BYTES).decode("utf-8-sig", "replace")
-        names = [line.strip() for line in data.splitlines() if line.strip()]
+        data = common.read_regular_file(file, f"--frames {text}", common.Limit.TEXT_BYTES)
+        lines = data.decode("utf-8-sig", "replace").splitlines()
+        names = [line.strip() for line in lines if line.strip()]
         numbered = bool(keys) and isinstance(keys[0], int)
         chosen = [int(name) for name in names if name.isdecimal()] if numbered else [*names]
     if not set(chosen) & set(keys):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
+
+from vehicle_detection.cli import common
 
 _COMMANDS = {
     "track": "video", "process": "video", "annotate": "video", "run": "video", "stream": "video",
@@ -15,33 +17,6 @@ _COMMANDS = {
     "finetune": "train-frames", "fine-tune": "train-frames", "show": "info", "model": "info",
     "version": "--version", "help": "--help",
 }  # fmt: skip
-_OPTIONS = {
-    "-o": "save save-path save-dir out output-dir output-file target dest project name o",
-    "--model": "weights net network checkpoint m",
-    "--conf": "confidence conf-thres conf-threshold threshold score-threshold min-conf min-score thresh",
-    "--jobs": "workers threads n-jobs num-workers processes nproc cpus j",
-    "--fov": "field-of-view hfov angle",
-    "--every": "stride vid-stride skip step frame-skip interval frame-interval",
-    "--device": "gpu cuda accelerator",
-    "--camera-height": "height mount-height cam-height",
-    "--camera": "lens calibration calib intrinsics",
-    "--tracks": "csv save-txt json results mot export save-csv",
-    "--boxes": "csv save-txt json results export save-csv",
-    "--show": "view display view-img imshow gui window preview",
-    "--units": "mph imperial miles metric unit",
-    "--no-audio": "no-sound mute an",
-    "--own-speed": "speed ego-speed",
-    "--gpx": "gps nmea",
-    "--labels": "label text hide-labels hide-conf no-labels",
-    "--line-width": "thickness line-thickness linewidth",
-    "--start": "begin from ss since",
-    "--end": "to until stop duration t",
-    "--quiet": "silent no-progress",
-    "--blur": "anonymize privacy hide-plates",
-    "--classes": "class filter-classes class-ids",
-}
-_INPUT = "source src input images image video file path i"
-"""Options of other tools for what is an argument here."""
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".ts")
 _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".heic")
 
@@ -58,19 +33,20 @@ def hint_command(word: str, commands: Iterable[str]) -> str:
     return f"use {found}" if found else f"the commands are {', '.join(commands)}"
 
 
-def hint_option(word: str, params: Iterable[Any]) -> str:
+def hint_option(word: str, params: Sequence[Any]) -> str:
     """Return what to write instead of an option that a command does not have; empty if that is unknown."""
-    options = {name: param for param in params for name in param.opts if name.startswith("-")}
-    name = word.lstrip("-").lower().replace("_", "-")
-    metavar = next((str(param.metavar) for param in params if not param.opts[0].startswith("-")), "")
-    if metavar and name in (*_INPUT.split(), metavar.lower()):
-        return f"pass {metavar} without an option"
-    words = {
-        each: option for option, listed in _OPTIONS.items() if option in options for each in listed.split()
-    }
-    words |= {option.lstrip("-"): option for option in options}
+    name = word.lstrip("-").lower().replace("-", "_")
+    argument, *_ = [*(str(param.metavar) for param in params if not param.opts[0].startswith("-")), ""]
+    if argument and name in ("source", *common.synonyms("source"), argument.lower()):
+        return f"pass {argument} without an option"
+    words: dict[str, tuple[Any, str]] = {}
+    for param in params:
+        if param.opts[0].startswith("-"):
+            words |= dict.fromkeys(common.synonyms(param.name), (param, param.opts[0]))
+    for param in params:
+        words |= {each.lstrip("-").replace("-", "_"): (param, each) for each in param.opts if each[0] == "-"}
     close = [name] if name in words else difflib.get_close_matches(name, words, n=1, cutoff=0.75)
-    return f"use {_usage(options[words[close[0]]], words[close[0]])}" if close else ""
+    return f"use {_usage(*words[close[0]])}" if close else ""
 
 
 def hint_value(param: Any) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import vehicle_detection as vd
+from vehicle_detection.cli import common
 from vehicle_detection.cli.output import print_error, print_line
-from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from vehicle_detection.video import FrameSource
@@ -42,11 +42,8 @@ def parse_horizon(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        from vehicle_detection._common import describe
-
-        raise InvalidInputError(
-            f"--horizon must be a fraction of the frame's height, such as 0.55, or auto; got {describe(text)}"
-        ) from None
+        expected = "be a fraction of the frame's height, such as 0.55, or auto"
+        raise common.invalid("--horizon", expected, text) from None
 
 
 def with_found_horizon(

@@ -9,6 +9,7 @@ from typing import Any
 from typer import Argument
 
 import vehicle_detection as vd
+from vehicle_detection.cli import common
 from vehicle_detection.cli.output import print_facts, print_line, print_table
 
 # Columns of the model card that a terminal has no room for.
@@ -24,11 +25,9 @@ def info(
     ),
 ) -> None:
     """Show a model's parameters, accuracy, training data and versions."""
-    from vehicle_detection._common import model_terms
-
     loaded = vd.load_model(model)
     title, facts = loaded.summary()
-    print_facts(f"{model}: {title}", {"license": model_terms(loaded.metadata), **facts})
+    print_facts(f"{model}: {title}", {"license": common.model_terms(loaded.metadata), **facts})
     for name, values in loaded.metadata.items():
         printed = False
         with contextlib.suppress(

@@ -11,7 +11,7 @@ from typing import Any, TypeVar, get_type_hints
 from typer import Option
 
 import vehicle_detection as vd
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.cli import common
 
 Options = TypeVar("Options")
 
@@ -104,8 +104,6 @@ NON_VEHICLES = option(..., "PATH", "Folder or zip of other patches, such as non-
 
 def parse_time(text: str | None, name: str) -> float | None:
     """Read a time in seconds, or as players show it: ``12:30`` or ``1:02:06.5``."""
-    from vehicle_detection._common import describe
-
     if text is None:
         return None
     clock = re.fullmatch(r"(?:(\d+):)?(\d+):(\d{1,2}(?:\.\d*)?)", text.strip())
@@ -115,9 +113,7 @@ def parse_time(text: str | None, name: str) -> float | None:
     try:
         return float(text)
     except ValueError:
-        raise InvalidInputError(
-            f"{name} must be a time in seconds or as [H:]M:S, such as 750 or 12:30; got {describe(text)}"
-        ) from None
+        raise common.invalid(name, "be a time in seconds or as [H:]M:S, such as 750 or 12:30", text) from None
 
 
 def parse_classes(text: str | None) -> list[str | int] | None:
@@ -135,8 +131,7 @@ def open_model(name: str, classes: str | None, device: Any) -> Any:
 
 def check_blur(region: str | None) -> None:
     """Check the region to blur before a model is loaded."""
-    from vehicle_detection._common import check_choice
     from vehicle_detection.drawing import BLUR_REGIONS
 
     if region is not None:
-        check_choice(region, "--blur", BLUR_REGIONS)
+        common.check_choice(region, "--blur", BLUR_REGIONS)

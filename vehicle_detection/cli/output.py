@@ -18,6 +18,7 @@ from typing import Any, Literal, TypeVar
 
 import typer
 
+from vehicle_detection.cli import common
 from vehicle_detection.errors import DatasetError, InvalidInputError, VehicleDetectionError
 
 # Printed where distances are shown although nothing is known of the lens.
@@ -175,11 +176,15 @@ def print_facts(title: str, facts: Mapping[str, Any]) -> None:
         print_line(f"  {name:<{width}}  {text}", indent=width + 4)
 
 
+def refuse_if(wrong: object, message: str) -> None:
+    """Refuse options that do not fit each other."""
+    if wrong:
+        raise InvalidInputError(message)
+
+
 def check_targets(targets: Mapping[str, Path | None], sources: Mapping[str, Path]) -> list[Path]:
     """Refuse targets that cannot be written or are also a source or another target; return those named."""
-    from vehicle_detection._common import check_target
-
-    named = {name: check_target(path, name) for name, path in targets.items() if path is not None}
+    named = {name: common.check_target(path, name) for name, path in targets.items() if path is not None}
     check_distinct_paths(named, sources)
     return list(named.values())
 
@@ -265,9 +270,7 @@ def output_folder(folder: Path | None, option: str) -> Iterator[None]:
     if folder is None:
         yield
         return
-    from vehicle_detection._common import check_path
-
-    check_path(folder, option, kind="a folder")
+    common.check_path(folder, option, kind="a folder")
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typer import Argument
 
 import vehicle_detection as vd
+from vehicle_detection.cli import common
 from vehicle_detection.cli.info import print_held_out
 from vehicle_detection.cli.options import option
 from vehicle_detection.cli.output import check_targets, name_kept_files, option_names, print_line
@@ -33,16 +34,16 @@ def train_frames(
 
     An interrupted training is continued by the same command.
     """
-    from vehicle_detection._common import check_suffix, pluralize
-
     targets = check_targets({"--output": output, "--curves": curves}, {"DATA": data})
-    check_suffix(output, "--output", (".onnx",))
+    common.check_suffix(output, "--output", (".onnx",))
     sources = vd.training.find_sources(data)
     for source in sources:
         for part in source.sets:
             empty = sum(not len(part.labels.rows(key)) for key in part.keys)
-            boxes = pluralize(len(part.labels), "box", "es")
-            print_line(f"{source.name}: {pluralize(len(part), 'frame')}, {boxes}, {empty} frames without any")
+            boxes = common.pluralize(len(part.labels), "box", "es")
+            print_line(
+                f"{source.name}: {common.pluralize(len(part), 'frame')}, {boxes}, {empty} frames without any"
+            )
     checkpoint = output.with_name(f"{output.name}.checkpoint")
     if checkpoint.exists():
         print_line(f"continuing the training of {checkpoint}")

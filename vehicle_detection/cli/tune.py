@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import vehicle_detection as vd
+from vehicle_detection.cli import common
 from vehicle_detection.cli.options import PATCHES, flag, option
 from vehicle_detection.cli.output import (
     check_targets,
@@ -64,21 +65,19 @@ def tune(
     cache: Path | None = option(None, "DIR", "Folder to keep features in, such as cache."),
 ) -> None:
     """Measure every combination of a grid of parameters, of training or of the search, and show the best."""
-    from vehicle_detection._common import check_choice, check_integer, check_suffix
-
-    check_integer(finalists, "--finalists", low=1)
+    common.check_integer(finalists, "--finalists", low=1)
     values = vd.training.parse_grid(grid)
-    check_choice(split, "--split", ("sequences", "groups", "random"))
+    common.check_choice(split, "--split", ("sequences", "groups", "random"))
     sources = {"--vehicles": vehicles, "--non-vehicles": non_vehicles, "--labels": labels}
     given = {name: path for name, path in sources.items() if path is not None}
     targets = check_targets({"--output": output, "--plot": plot}, given)
-    check_suffix(output, "--output", (".csv", ".jsonl", ".parquet"))
+    common.check_suffix(output, "--output", (".csv", ".jsonl", ".parquet"))
     searches = set(values) <= set(_SEARCH)
     writes_table = searches or output.suffix.lower() != ".jsonl"  # rows of trials are stored one by one
     if writes_table:
         vd.training.check_replaceable(output, "--output")
     if plot is not None:
-        check_suffix(plot, "--plot", (".png", ".svg", ".pdf"))
+        common.check_suffix(plot, "--plot", (".png", ".svg", ".pdf"))
     labelled = _read_frames(frames, labels, horizon)
     if searches:
         if labelled is None:
@@ -197,9 +196,7 @@ def _text(value: float, digits: int) -> str:
 def _draw(table: DataFrame, path: Path, look: Mapping[str, str]) -> None:
     from matplotlib.figure import Figure
 
-    from vehicle_detection._common import atomic_write
-
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     vd.notebook.plot_tradeoff(table, ax=figure.subplots(), **look)
-    with atomic_write(path) as part:
+    with common.atomic_write(path) as part:
         figure.savefig(part)

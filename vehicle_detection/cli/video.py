@@ -1,18 +1,44 @@
-"""The command that tracks the vehicles of a video."""
+"""The command that tracks the vehicles of a video, with its options and what it writes."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from dataclasses import replace
+import itertools
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
+from typer import Argument
 
 import vehicle_detection as vd
-from vehicle_detection.cli.horizon import is_limited, search_everywhere, warn_of_horizon, with_found_horizon
-from vehicle_detection.cli.options import check_blur, open_model, takes
+from vehicle_detection.cli import common
+from vehicle_detection.cli import options as shared
+from vehicle_detection.cli.horizon import (
+    is_limited,
+    parse_horizon,
+    search_everywhere,
+    warn_of_horizon,
+    with_found_horizon,
+)
+from vehicle_detection.cli.options import (
+    HORIZON_HELP,
+    camera_option,
+    check_blur,
+    drawing_flag,
+    drawing_option,
+    input_flag,
+    input_option,
+    open_model,
+    output_flag,
+    output_option,
+    parse_time,
+    search_option,
+    takes,
+)
 from vehicle_detection.cli.output import (
     DAMAGED,
     UNKNOWN_LENS,
@@ -23,13 +49,164 @@ from vehicle_detection.cli.output import (
     output_folder,
     print_error,
     print_line,
+    refuse_if,
 )
-from vehicle_detection.cli.video_options import VideoOptions
-from vehicle_detection.cli.video_outputs import SideOutputs, read_speed
-from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from vehicle_detection.video import FrameSource, VideoReport
+
+# Fraction of the frames without a known own speed from which on a warning is printed.
+_MAX_UNKNOWN = 0.05
+_MAX_OWN_SPEED = 500.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoOptions:
+    """Options of ``video``."""
+
+    source: str = Argument(
+        ...,
+        metavar="SOURCE",
+        help="Video file, such as drive.mp4; folder or quoted pattern of a trip's segments, or images; "
+        "URL; camera, such as 0; or -.",
+    )
+    output: Path | None = output_option(
+        None,
+        "TARGET",
+        "Video to write: .mp4, .m4v, .mov or .mkv; default: beside the source, such as drive_tracked.mp4.",
+        "-o",
+        "--output",
+    )
+    show: bool = output_flag("--show", "Show the annotated frames in a window; Escape ends the run.")
+    tracks: Path | None = output_option(
+        None, "FILE", "Tracks: .csv, .jsonl, .parquet, .txt (MOT), .zip (CVAT) or .json (COCO)."
+    )
+    report: Path | None = output_option(None, "FILE.html", "Page with the video and its tracks.")
+    why: bool = output_flag("--why", "Explain a box of each vehicle in --report: the share of each cell.")
+    events: Path | None = output_option(
+        None, "FILE", "Events, such as cut-ins and overtaking: .csv or .json."
+    )
+    clips: Path | None = output_option(
+        None, "DIR", "Folder for a short annotated clip of each event, such as clips."
+    )
+    clips_of: str | None = output_option(
+        None, "KINDS", "Kinds of events for --clips, such as cut_in,closing; default: all."
+    )
+    srt: Path | None = output_option(
+        None, "FILE", "Subtitles with vehicles, nearest distance and events, second by second: .srt or .ass."
+    )
+    preset: str = shared.PRESET
+    crf: int | None = output_option(None, "N", "Quality of the video, 0 (best) to 51; default: 23.")
+    encoder: str = output_option(
+        "x264", "NAME", "x264, nvenc, vaapi, videotoolbox, or auto: a graphics processor's if one works."
+    )
+    no_audio: bool = shared.NO_AUDIO
+    quiet: bool = output_flag("-q", "Print errors and warnings of damage only.", "--quiet")
+    profile: bool = output_flag("--profile", "Print the processor time and the waiting of each stage.")
+    start: str | None = input_option(None, "TIME", "Start time, such as 12.5 (seconds) or 12:30.")
+    end: str | None = input_option(None, "TIME", "End time, such as 30 (seconds) or 1:02:06.")
+    fps: float | None = input_option(
+        None, "N", "Frame rate of images, a raw stream such as .h264, a pipe or a camera, such as 10."
+    )
+    stream: int | None = input_option(
+        None, "N", "Video stream of a file with several, by ffmpeg's number, such as 1."
+    )
+    own_speed: str | None = input_option(
+        None, "SPEED", "Own speed in km/h, such as 100, or 62mph, for headways and speeds over ground."
+    )
+    gpx: Path | None = input_option(
+        None,
+        "FILE",
+        "Own speed over time: a GPX track, NMEA sentences, or a .csv table with time_s and speed_kmh.",
+    )
+    gpx_offset: float = input_option(
+        0.0,
+        "S",
+        "Time of the video's start in --gpx: seconds after the first point of a track, or the "
+        "time_s of a table, such as 12.5 or -3.",
+    )
+    live: bool = input_flag(
+        "--live", "Drop frames of a pipe rather than lag; default for cameras and streams."
+    )
+    no_reconnect: bool = input_flag("--no-reconnect", "End with a network stream that breaks off.")
+    strict: bool = input_flag("--strict", "Fail, and write nothing, if the source is damaged.")
+    camera: str | None = shared.CAMERA
+    fov: float | None = shared.FIELD_OF_VIEW
+    camera_height: float | None = shared.CAMERA_HEIGHT
+    horizon: str | None = camera_option(
+        None, "F|auto", f'{HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.'
+    )
+    model: str = shared.MODEL
+    classes: str | None = shared.CLASSES
+    device: str = shared.DEVICE
+    conf: float | None = shared.CONFIDENCE
+    every: int | None = shared.EVERY
+    jobs: int | None = search_option(
+        None, "N", "Frames searched in parallel, such as 2; default: one per core, at most 4."
+    )
+    labels: str = drawing_option(
+        "id,distance,speed",
+        "LIST",
+        "Fields of the labels: some of id,distance,speed,score,std, such as id,distance; or none.",
+    )
+    line_width: int | None = shared.LINE_WIDTH
+    color_by: str = drawing_option("id", "id|distance", "What the colors of the boxes stand for.")
+    panel: str = drawing_option(
+        "none", "corner|side|none", "Bird's-eye view in the frame's corner, or beside it."
+    )
+    units: str = drawing_option(
+        "metric", "metric|imperial", "Labels, subtitles and report in m and km/h, or ft and mph."
+    )
+    blur: str | None = shared.BLUR
+    diagnostics: bool = drawing_flag(
+        "--diagnostics", "Show frame, positive windows, heat map and tracks side by side."
+    )
+
+    def files(self) -> dict[str, Path | None]:
+        """Files to write, by their options."""
+        return {f"--{name}": getattr(self, name) for name in ("output", "tracks", "report", "events", "srt")}
+
+    def with_target(self) -> VideoOptions:
+        """Name the video to write if one is needed and none or a folder is named; it replaces no file."""
+        source, folder = Path(self.source), self.output
+        if self.source.isdecimal() or "*" in self.source or self.source == "-" or common.is_url(self.source):
+            return self
+        if folder is None:
+            alone = not self.show and all(path is None for path in self.files().values())
+            if not alone and self.report is None and self.clips is None:
+                return self
+            folder = source.parent
+        elif not folder.is_dir():
+            return self
+        numbers = itertools.chain([""], (f"_{number}" for number in itertools.count(2)))
+        targets = (folder / f"{source.stem}_tracked{number}.mp4" for number in numbers)
+        return replace(self, output=next(target for target in targets if not target.exists()))
+
+    def span(self) -> dict[str, Any]:
+        """First and last second of the source."""
+        return {"start": parse_time(self.start, "--start"), "end": parse_time(self.end, "--end")}
+
+    def encoding(self) -> Any:
+        """How the copy is encoded."""
+        from vehicle_detection.video import Encoding
+
+        return Encoding(preset=self.preset, crf=self.crf, encoder=self.encoder)  # type: ignore[arg-type]
+
+    def stated_horizon(self) -> float | None:
+        """Return the horizon that the option states; None if it states none, or is to be estimated."""
+        return None if self.horizon in (None, "auto") else parse_horizon(str(self.horizon))
+
+    def draw_params(self) -> vd.DrawParams:
+        """Parameters of the annotations."""
+        fields = [field.strip() for field in self.labels.split(",")]
+        style: dict[str, Any] = {"color_by": self.color_by, "panel": self.panel, "units": self.units}
+        return vd.DrawParams(labels=() if fields == ["none"] else fields, line_width=self.line_width, **style)
+
+    def open_source(self) -> FrameSource:
+        """Open the source."""
+        options: dict[str, Any] = {"live": self.live or None, "reconnect": not self.no_reconnect}
+        options |= {"fps": self.fps, "stream": self.stream, "strict": self.strict}
+        return vd.open_trip(self.source, **options)
 
 
 @option_names(target="--output", height_m="--camera-height")
@@ -93,7 +270,6 @@ def _check_run(options: VideoOptions, source: FrameSource, detector: vd.VehicleD
 
 def _check(options: VideoOptions) -> None:
     """Refuse options that do not fit each other, and a run without any output."""
-    from vehicle_detection._common import check_suffix
     from vehicle_detection.camera import LENSES
     from vehicle_detection.formats import FORMATS
 
@@ -104,32 +280,28 @@ def _check(options: VideoOptions) -> None:
     suffixes |= {"--events": vd.drive.EVENT_SUFFIXES, "--srt": vd.drive.SUBTITLE_SUFFIXES}
     for name, allowed in suffixes.items():
         if (path := files[name]) is not None:
-            check_suffix(path, name, allowed)
-    if options.output is None:
-        for name, path, purpose in (
-            ("--report", options.report, "contains it"),
-            ("--clips", options.clips, "are cut out of it"),
-        ):
-            if path is not None:
-                raise InvalidInputError(f"--output must name a video for {name}, which {purpose}; add it")
-        if not options.show and all(path is None for path in files.values()):
-            raise InvalidInputError(
-                "--output must name the video to write; or use --show, --tracks, --events or --srt"
-            )
-    if options.why and options.report is None:
-        raise InvalidInputError("--why needs --report, which shows the explanations; add it")
-    camera = options.camera
-    if camera is not None and camera not in LENSES and not Path(camera).is_file():
-        raise InvalidInputError(
-            f"--camera must be one of {', '.join(LENSES)} or an existing JSON file; got {camera!r}; "
-            "or state the lens with --fov"
-        )
-    if options.diagnostics and options.panel != "none":
-        raise InvalidInputError("--panel has no place with --diagnostics; omit one of them")
+            common.check_suffix(path, name, allowed)
+    camera, target, screen = options.camera, options.output, options.show
+    needs_video = "--output must name a video for"
+    refuse_if(options.report and not target, f"{needs_video} --report, which contains it; add it")
+    refuse_if(options.clips and not target, f"{needs_video} --clips, which are cut out of it; add it")
+    refuse_if(
+        not screen and not any(files.values()),
+        "--output must name the video to write; or use --show, --tracks, --events or --srt",
+    )
+    unread = options.why and not options.report
+    refuse_if(unread, "--why needs --report, which shows the explanations; add it")
+    refuse_if(
+        camera is not None and camera not in LENSES and not Path(camera).is_file(),
+        f"--camera must be one of {', '.join(LENSES)} or an existing JSON file; got {camera!r}; "
+        "or state the lens with --fov",
+    )
+    both = options.diagnostics and options.panel != "none"
+    refuse_if(both, "--panel has no place with --diagnostics; omit one of them")
     check_blur(options.blur)
     options.encoding()
-    if options.blur is not None and options.output is None and not options.show:
-        raise InvalidInputError("--output must name a video for --blur, which blurs its vehicles; add it")
+    unseen = options.blur and not target and not screen
+    refuse_if(unseen, f"{needs_video} --blur, which blurs its vehicles; add it")
 
 
 @contextlib.contextmanager
@@ -146,10 +318,8 @@ def _open(options: VideoOptions) -> Iterator[tuple[FrameSource, vd.VehicleDetect
         if speed is not None:
             speed = replace(speed, clock=vd.drive.segment_clock(source))
         annotator = vd.Annotator(style, own_speed=speed, **drawing)
-        if options.why and not source.rereadable:
-            raise InvalidInputError(
-                f"--why needs a source that can be read again, got {options.source}; use a file, or omit it"
-            )
+        once = f"--why needs a source that can be read again, got {options.source}; use a file, or omit it"
+        refuse_if(options.why and not source.rereadable, once)
         if options.horizon == "auto":
             # The estimate takes seconds: refuse invalid options before it.
             with vd.VehicleDetector(model, conf=options.conf, camera=camera, annotator=annotator) as unsure:
@@ -183,3 +353,113 @@ def _warn_of_camera(
         return
     with options.open_source() as again, search_everywhere(detector.model, options.conf) as everywhere:
         warn_of_horizon(given, estimate_video_horizon(again, everywhere, **options.span()))
+
+
+def read_speed(own_speed: str | None, gpx: Path | None, offset: float) -> vd.drive.OwnSpeed | None:
+    """Speed of the own vehicle: constant (km/h, or with its unit), from a file, or unknown."""
+    if gpx is not None:
+        refuse_if(own_speed, "--own-speed and --gpx both state the own speed; give one of them")
+        with option_names(path="--gpx", offset="--gpx-offset"):
+            return vd.read_own_speed(gpx, offset=offset)
+    refuse_if(offset, "--gpx-offset needs --gpx; give the file, or omit the offset")
+    if own_speed is None:
+        return None
+    found = re.fullmatch(r"(\d{1,3}(?:\.\d*)?) ?(km/h|kmh|mph)?", own_speed.strip().lower())
+    if found is None or float(found[1]) > _MAX_OWN_SPEED:
+        raise common.invalid(
+            "--own-speed", f"be a speed of at most {_MAX_OWN_SPEED:g}, such as 100 (km/h) or 62mph", own_speed
+        )
+    unit = common.UNITS["imperial" if found[2] == "mph" else "metric"].speed
+    return vd.drive.OwnSpeed.constant(float(found[1]) / unit)
+
+
+class SideOutputs:
+    """Files of ``video`` beside the video; their options are checked before the work starts."""
+
+    def __init__(self, options: VideoOptions) -> None:
+        self._options = options
+        self._page: vd.ReportWriter | None = None
+        self._table: vd.TrackTable
+        self._events: tuple[vd.drive.Event, ...] = ()
+        self._clip_kinds: list[str] = [*vd.drive.KINDS]
+        if options.clips_of is not None:
+            refuse_if(options.clips is None, "--clips-of needs --clips, the folder of the clips; add it")
+            self._clip_kinds = [kind.strip() for kind in options.clips_of.split(",")]
+        for kind in self._clip_kinds:
+            common.check_choice(kind, "--clips-of", vd.drive.KINDS)
+
+    @contextlib.contextmanager
+    def collect(
+        self, source: FrameSource, detector: vd.VehicleDetector
+    ) -> Iterator[list[Callable[[Any], object]]]:
+        """Yield functions that take each frame's result; the file of tracks is complete after the block."""
+        options, units = self._options, detector.annotator.style.units
+        writers: list[Callable[[Any], object]] = []
+        if options.report is not None and options.output is not None:
+            page: dict[str, Any] = {"video": options.output, "source": options.source, "units": units}
+            with option_names(path="--report"):
+                self._page = vd.ReportWriter(options.report, detector=detector, **page)
+        self._table = self._page.table if self._page else vd.TrackTable()
+        # A camera that never ends would fill the memory with tracks that nobody asked for.
+        wanted = options.report, options.events, options.clips, options.srt
+        if not options.quiet or any(path is not None for path in wanted):
+            writers.append(self._table.append)
+        with contextlib.ExitStack() as stack:
+            if options.tracks is not None:
+                with option_names(path="--tracks"):
+                    table = vd.open_tracks(
+                        options.tracks, shape=source.info.shape, fps=float(source.info.fps)
+                    )
+                    writers.append(stack.enter_context(table))
+            yield writers
+
+    def write(self, done: VideoReport, detector: vd.VehicleDetector) -> None:
+        """Find the events, and write all files but that of the tracks."""
+        options, fps, table = self._options, float(done.fps), self._table
+        events = self._events = self._find_events(done, detector)
+        if options.events is not None:
+            with option_names(path="--events"):
+                vd.write_events(events, options.events)
+        if options.srt is not None:
+            units = detector.annotator.style.units
+            with option_names(path="--srt"):
+                own: Any = detector.annotator.own_speed
+                vd.write_subtitles(table, options.srt, fps=fps, events=events, own_speed=own, units=units)
+        if self._page is not None:
+            pictures: list[vd.drive.TrackPicture] = []
+            if options.why:
+                with options.open_source() as again:
+                    pictures = vd.drive.explain_tracks(detector, again, table, every=options.every)
+            self._page.finish(done, events=events, pictures=pictures)
+        if options.clips is not None and options.output is not None:
+            # Last, because there may be thousands of clips.
+            chosen = [event for event in events if event.kind in self._clip_kinds]
+            progress = not options.quiet
+            vd.drive.cut_clips(chosen, options.output, options.clips, fps=fps, progress=progress)
+
+    def _find_events(self, done: VideoReport, detector: vd.VehicleDetector) -> tuple[vd.drive.Event, ...]:
+        """Find the events of a processed video, and warn if the own speed is unknown for a part of it."""
+        import numpy as np
+
+        table, fps, speeds = self._table, float(done.fps), None
+        own: Any = detector.annotator.own_speed
+        if own is not None:
+            speeds = vd.drive.own_speeds(own, table, fps=fps)
+            unknown = float(np.isnan(speeds).mean()) if len(speeds) else 0.0
+            if unknown > _MAX_UNKNOWN and not self._options.quiet:
+                print_error(
+                    f"warning: the own speed is known for {1 - unknown:.0%} of the video; check "
+                    "--gpx-offset, and that the file has no gaps of over 5 s"
+                )
+        camera = detector.camera.for_shape(done.shape)
+        return vd.find_events(table, fps=fps, shape=done.shape, camera=camera, own_speed_mps=speeds)
+
+    def print_summary(self, done: VideoReport) -> None:
+        """Print the counts of a drive in one line, and the number of events of each other kind in another."""
+        if not len(self._table.frame_keys):
+            return
+        print_line(vd.count_vehicles(self._events, self._table, fps=float(done.fps)).summary())
+        kinds = Counter(event.kind for event in self._events if event.kind not in vd.drive.COUNTED)
+        if kinds:
+            listed = (f"{kinds[kind]} {name}" for kind, name in vd.drive.KINDS.items() if kinds[kind])
+            print_line(f"events: {', '.join(listed)}")

@@ -27,6 +27,7 @@ from vehicle_detection._common import (
     describe,
     hide_credentials,
     import_pyarrow,
+    invalid,
     pluralize,
     progress_bar,
 )
@@ -247,9 +248,7 @@ def run_batch(
 
 def _check_callables(executor: object, on_record: object) -> None:
     if executor is not None and not hasattr(executor, "submit"):
-        raise InvalidInputError(
-            f"executor must be an executor of concurrent.futures, got {describe(executor)}; omit it"
-        )
+        raise invalid("executor", "be an executor of concurrent.futures", executor, "omit it")
     if on_record is not None and not callable(on_record):
         raise InvalidInputError(f"on_record must be a function of a record; got {describe(on_record)}")
 
@@ -259,9 +258,7 @@ def _parse_shard(shard: object) -> tuple[int, int]:
         return 1, 1
     found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", shard) if isinstance(shard, str) else None
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
-        raise InvalidInputError(
-            f"shard must be a number and a count, such as 3/200 for the third of 200; got {describe(shard)}"
-        )
+        raise invalid("shard", "be a number and a count, such as 3/200 for the third of 200", shard)
     return int(found[1]), int(found[2])
 
 
@@ -286,9 +283,7 @@ def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -
     try:
         json.dumps(settings)
     except TypeError as error:
-        raise InvalidInputError(
-            f"options must hold numbers, strings, lists and None, got {describe(options)}; {error}"
-        ) from None
+        raise invalid("options", "hold numbers, strings, lists and None", options, f"{error}") from None
     try:
         open_detector(name, **given).close()  # an error now, not in every worker
     except TypeError as error:

@@ -17,8 +17,8 @@ from vehicle_detection import __version__
 from vehicle_detection._common import (
     check_path,
     check_sequence,
-    describe,
     hide_credentials,
+    invalid,
     is_hidden,
     is_url,
     local_path,
@@ -44,9 +44,7 @@ def list_videos(sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str
     given = (sources,) if single else check_sequence(sources, "sources", "files, folders, patterns or URLs")
     for source in given:
         if not isinstance(source, (str, os.PathLike)) or not str(source).strip():
-            raise InvalidInputError(
-                f"sources must be files, folders, patterns or URLs, got {describe(source)}; pass their names"
-            )
+            raise invalid("sources", "be files, folders, patterns or URLs", source, "pass their names")
         text = local_path(os.fspath(source))
         if not is_url(text):
             check_path(text, "sources", kind="a file, folder or pattern")

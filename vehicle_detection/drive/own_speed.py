@@ -25,7 +25,7 @@ from vehicle_detection._common import (
     check_array,
     check_number,
     check_path,
-    describe,
+    invalid,
     pluralize,
     read_regular_file,
     shorten,
@@ -76,9 +76,7 @@ class OwnSpeed:
             given = getattr(self, name)
             values = check_array(given, name)
             if values.ndim != 1 or not len(values) or values.dtype.kind not in "iuf":
-                raise InvalidInputError(
-                    f"{name} must be a list of numbers, got {describe(given)}; pass at least one"
-                )
+                raise invalid(name, "be a list of numbers", given, "pass at least one")
             if not np.isfinite(values).all():
                 raise InvalidInputError(f"{name} must be finite, got NaN or infinity; drop these values")
             object.__setattr__(self, name, values.astype(np.float64))
@@ -97,9 +95,7 @@ class OwnSpeed:
         clock = check_array(self.clock, "clock")
         pairs = clock.ndim == 2 and clock.shape[1] == 2 and clock.dtype.kind in "iuf"
         if clock.size and not (pairs and np.isfinite(clock).all()):
-            raise InvalidInputError(
-                f"clock must be pairs of seconds, got {describe(self.clock)}; pass what segment_clock returns"
-            )
+            raise invalid("clock", "be pairs of seconds", self.clock, "pass what segment_clock returns")
 
     @classmethod
     def constant(cls, speed_mps: float) -> OwnSpeed:
@@ -111,9 +107,7 @@ class OwnSpeed:
         """Speed in m/s at each time: interpolated; NaN before, after and in long gaps of the record."""
         given = check_array(seconds, "seconds")
         if given.dtype.kind not in "iuf":
-            raise InvalidInputError(
-                f"seconds must be numbers, got {describe(seconds)}; pass times in seconds"
-            )
+            raise invalid("seconds", "be numbers", seconds, "pass times in seconds")
         times: Floats = given.astype(np.float64)
         if self.clock:
             played, recorded = np.array(self.clock).T

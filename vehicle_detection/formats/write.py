@@ -23,6 +23,7 @@ from vehicle_detection._common import (
     check_target,
     check_type,
     describe,
+    invalid,
     is_listing,
     open_parquet,
     spreadsheet_text,
@@ -294,9 +295,7 @@ def _new_folder(path: Path, kind: str) -> Iterator[Path]:
 def _check_format(path: object, name: str | None, allowed: Iterable[str]) -> str:
     """Choose the format by its name or the suffix, and check the target before any work is done."""
     if not isinstance(path, (str, os.PathLike)):
-        raise InvalidInputError(
-            f"path must be a file name, got {describe(path)}; pass a name such as 'tracks.csv'"
-        )
+        raise invalid("path", "be a file name", path, "pass a name such as 'tracks.csv'")
     choices = tuple(dict.fromkeys(allowed))
     kind = FORMATS.get(Path(path).suffix.lower()) if name is None else name
     if name is None and kind not in choices:
@@ -416,9 +415,7 @@ def write_tracks(
     """
     if not isinstance(results, TrackTable):
         if isinstance(results, Mapping) or not is_listing(results):
-            raise InvalidInputError(
-                f"results must be a list of FrameResult or a TrackTable, got {describe(results)}"
-            )
+            raise invalid("results", "be a list of FrameResult or a TrackTable", results)
         with open_tracks(path, format=format, shape=shape, fps=fps) as stream:
             for result in results:
                 stream(result)

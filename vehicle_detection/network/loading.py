@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Limit, check_path, check_sequence, describe, read_regular_file
+from vehicle_detection._common import Limit, check_path, check_sequence, invalid, read_regular_file
 from vehicle_detection.boxes import logit
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.network.model import INPUT_SIZE, NetworkModel, NetworkParams
@@ -235,9 +235,7 @@ def _class_ids(
         if not is_number or not 0 <= number < count or (known and number not in known):
             listed = ", ".join(f"{text} ({n})" for n, text in known.items())
             listed = listed or "numbers only" + f", below {count}" * (count < 1 << 31)
-            raise InvalidInputError(
-                f"classes must be classes of {name}, got {describe(each)}; it has {listed}"
-            )
+            raise invalid("classes", f"be classes of {name}", each, f"it has {listed}")
         ids.append(int(number))
     if not ids:
         raise InvalidInputError("classes must hold at least one class; omit it for all vehicles")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Checked, Floats, describe, integer, number, pluralize
+from vehicle_detection._common import Checked, Floats, integer, invalid, number, pluralize
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 
@@ -356,9 +356,7 @@ def shown_tracks(tracks: Iterable[Any]) -> list[Any]:
     shown = []
     for track in [tracks] if isinstance(tracks, str) or not isinstance(tracks, Iterable) else tracks:
         if not hasattr(track, "id") or not hasattr(track, "box"):
-            raise InvalidInputError(
-                f"tracks must be Track objects, got {describe(track)}; pass result.tracks"
-            )
+            raise invalid("tracks", "be Track objects", track, "pass result.tracks")
         if getattr(track, "shown", True):
             shown.append(track)
     repeated = next((track for track, times in Counter(each.id for each in shown).items() if times > 1), None)

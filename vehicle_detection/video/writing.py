@@ -27,6 +27,7 @@ from vehicle_detection._common import (
     check_suffix,
     check_type,
     describe,
+    invalid,
     temporary_folder,
 )
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
@@ -313,9 +314,8 @@ class _Drawing:
         assert frame is not None
         drawn = self._annotator.draw(frame, result)
         if getattr(drawn, "shape", None) != self._shape or drawn.dtype != np.uint8:
-            raise InvalidInputError(
-                f"annotator.draw must return a {self._shape} uint8 array, got {describe(drawn)}; "
-                "draw on a copy of the frame"
+            raise invalid(
+                "annotator.draw", f"return a {self._shape} uint8 array", drawn, "draw on a copy of the frame"
             )
         missed = result.index - self._expected if self._expected >= 0 else 0
         self._expected = result.index + 1
