@@ -7,8 +7,8 @@ import pytest
 
 from tests.drive.report_helpers import FRAMES, StrictParser, video_report, write_report
 from vehicle_detection.drive import ReportWriter
+from vehicle_detection.drive import report as page
 from vehicle_detection.drive import report as writer
-from vehicle_detection.drive import report_page as page
 from vehicle_detection.errors import InvalidInputError
 
 

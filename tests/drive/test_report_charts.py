@@ -11,9 +11,9 @@ from vehicle_detection.drive.report_charts import (
     Label,
     TimeAxis,
     ValueAxis,
-    _assign_rows,
-    _separate_labels,
+    assign_rows,
     format_time,
+    separate_labels,
 )
 
 
@@ -47,7 +47,7 @@ def test_ticks_of_a_time_axis_lie_in_the_video(frames, fps):
 @given(st.lists(st.tuples(st.floats(0, 100), st.floats(-10, 160)), max_size=20))
 def test_labels_do_not_overlap(places):
     labels = [Label(x, y, number) for number, (x, y) in enumerate(places)]
-    kept = _separate_labels(labels, 150)
+    kept = separate_labels(labels, 150)
     for one, other in combinations(kept, 2):
         assert abs(one.x - other.x) >= 5 or abs(one.y - other.y) >= 13 - 1e-9
     assert all(0 < label.y <= 150 for label in kept)
@@ -61,7 +61,7 @@ def test_labels_do_not_overlap(places):
 @given(PRESENCE)
 def test_tracks_that_share_a_row_do_not_overlap(frames):
     tracks = track_histories(table_of(frames))
-    rows = _assign_rows(tracks, TimeAxis(max(len(frames), 1), 25.0))
+    rows = assign_rows(tracks, TimeAxis(max(len(frames), 1), 25.0))
     for (one, row), (other, same) in combinations(zip(tracks, rows), 2):
         assert row != same or one.last < other.first
     assert sorted(set(rows)) == list(range(len(set(rows))))

@@ -29,7 +29,7 @@ from vehicle_detection.camera import Camera
 from vehicle_detection.detector import VehicleDetector, load_model
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.drive import Event, OwnSpeed, ReportWriter, TrackPicture
-from vehicle_detection.drive import report_page as page
+from vehicle_detection.drive import report as page
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.svm import load_classifier
 from vehicle_detection.tracking import TrackParams

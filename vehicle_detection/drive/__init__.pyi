@@ -4,8 +4,7 @@ from .counts import COUNTED, MinuteCounts, VehicleCounts, count_vehicles
 from .event_files import EVENT_SUFFIXES, cut_clips, write_events
 from .events import EVENT_COLUMNS, KINDS, Event, find_events
 from .own_speed import OwnSpeed, own_speeds, read_own_speed
-from .report import ReportWriter, explain_tracks
-from .report_page import TrackPicture
+from .report import ReportWriter, TrackPicture, explain_tracks
 from .subtitles import SUBTITLE_SUFFIXES, write_subtitles
 from .trips import Trip, find_trips, open_trip, segment_clock
 from .worker_pool import open_dask
