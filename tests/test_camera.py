@@ -239,7 +239,7 @@ def test_a_camera_file_by_hand(tmp_path):
     [
         ("{", r"camera file .+ is not JSON"),
         pytest.param("[" * 100_000, r"camera file .+ is not JSON: it is nested too deeply", id="deep"),
-        ("[1]", r"camera file .+ must be an object with the names of read_camera; got"),
+        ("[1]", r"camera file .+ must be an object with the names of read_camera, got"),
         ('{"zoom": 1}', r"must be an object with the names .*; got zoom"),
         ('{"focal_px": 900}', r"camera.json: focal_px needs image_size"),
         (

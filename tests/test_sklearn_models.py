@@ -137,7 +137,7 @@ def test_pipelines_that_cannot_be_converted(patches, labels):
     ):
         with pytest.raises(InvalidInputError, match=message):
             VehicleClassifier.from_pipeline(pipeline, SMALL)
-    with pytest.raises(InvalidInputError, match=r"must be the FeatureParams of .*; got None"):
+    with pytest.raises(InvalidInputError, match=r"must be the FeatureParams of .*, got None"):
         VehicleClassifier.from_pipeline(fit(StandardScaler(), LinearSVC()))
 
 

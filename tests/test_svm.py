@@ -243,7 +243,7 @@ def test_bad_options(options, message):
 @pytest.mark.parametrize(
     ("X", "message"),
     [
-        (np.zeros((2, 5)), r"X must be \(N, \d+\) features or \(N, 64, 64, 3\) patches; got .*\(2, 5\)"),
+        (np.zeros((2, 5)), r"X must be \(N, \d+\) features or \(N, 64, 64, 3\) patches, got .*\(2, 5\)"),
         (np.full((1, SMALL.length), np.nan), "X must be finite, got NaN or infinity"),
         (np.zeros((2, 64, 64, 3)), r"X must be an \(N, 64, 64, 3\) uint8 RGB array .*float64"),
     ],

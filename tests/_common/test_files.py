@@ -1,7 +1,5 @@
-import contextlib
 import errno
 import os
-import signal
 import stat
 import subprocess
 import sys
@@ -221,77 +219,6 @@ def test_a_file_system_without_locks_and_permissions(tmp_path, monkeypatch):
         assert folder.is_dir()
     assert (tmp_path / "out.csv").read_text() == "new"
     assert names(tmp_path) == ["out.csv"]
-
-
-def run_interrupted(function, number):
-    """Call a function with an interrupt before instruction `number`; False if it ends before."""
-    left = number
-
-    def trace(frame, event, _):
-        nonlocal left
-        if frame.f_code.co_filename not in (files.__file__, contextlib.__file__):
-            return None
-        frame.f_trace_opcodes = True
-        if event == "opcode":
-            left -= 1
-            if left == 0:
-                signal.raise_signal(signal.SIGINT)
-        return trace
-
-    before, handler = sys.gettrace(), signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        sys.settrace(trace)
-        function()
-    except KeyboardInterrupt:
-        return True
-    finally:
-        sys.settrace(before)
-        signal.signal(signal.SIGINT, handler)
-    return left <= 0
-
-
-def interrupt_everywhere(place):
-    """Interrupt the writing of a file and the use of a folder at every third instruction.
-
-    Returns the numbers of their instructions.
-    """
-
-    def write():
-        with atomic_write(place / "out.csv") as part:
-            part.write_text("whole")
-
-    def use_folder():
-        with temporary_folder(place, "demo") as folder:
-            (folder / "clip.mp4").write_text("half")
-
-    numbers = []
-    for function in (write, use_folder):
-        number = 1
-        while run_interrupted(function, number):
-            assert names(place) in ([], ["out.csv"]), f"{function.__name__}, instruction {number}"
-            number += 3
-        numbers.append(number)
-        assert (place / "out.csv").read_text() == "whole"
-    return numbers
-
-
-def test_an_interrupt_at_any_time_leaves_no_temporary_files(tmp_path):
-    # In a process of its own, because CPython 3.11 misbehaves after the tracing of instructions.
-    program = (
-        "import sys, pathlib; from tests._common.test_files import interrupt_everywhere; "
-        "print(*interrupt_everywhere(pathlib.Path(sys.argv[1])))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program, tmp_path],
-        cwd=Path(__file__).parents[2],
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    numbers = [int(line) for line in done.stdout.split()]
-    if numbers == [1, 1]:
-        pytest.skip("this Python reports no instructions to a trace function")  # 3.12.1
-    assert min(numbers) > 100
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks of folders")

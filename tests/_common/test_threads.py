@@ -41,7 +41,7 @@ def test_the_argument_overrides_the_environment_variable_which_overrides_all_cor
 @pytest.mark.parametrize("text", ["1025", "9" * 5000, "0", "-1", "two", "1.5", " 2", "²", "1e3"])
 def test_an_invalid_environment_variable(monkeypatch, text):
     monkeypatch.setenv(JOBS_VARIABLE, text)
-    with pytest.raises(InvalidInputError, match=f"^{JOBS_VARIABLE} must be .* from 1 to 1024; got"):
+    with pytest.raises(InvalidInputError, match=f"^{JOBS_VARIABLE} must be .* from 1 to 1024, got"):
         resolve_jobs()
 
 

@@ -67,7 +67,7 @@ def check_numbers(printed):
 def test_a_killed_worker_is_replaced(many, model, tmp_path, start_batch):
     out = tmp_path / "out"
     with unfinished(out, last_of(many)):
-        process = start_batch(many, out, model, "--tracks-only")
+        process = start_batch(many, out, model, "--tracks-only", jobs=1)
         wait_for_records(out, 1)
         workers = processes_below(process.pid)
         assert workers
@@ -85,7 +85,7 @@ def test_a_killed_worker_is_replaced(many, model, tmp_path, start_batch):
 def test_a_killed_batch_is_resumed_by_the_same_command(many, model, tmp_path, start_batch):
     out = tmp_path / "out"
     with unfinished(out, last_of(many)):
-        process = start_batch(many, out, model)
+        process = start_batch(many, out, model, jobs=1)
         wait_for_records(out, 2)
         os.kill(process.pid, signal.SIGKILL)
         process.communicate()
@@ -132,7 +132,7 @@ def test_two_batches_on_one_folder_share_the_work(many, model, tmp_path, start_b
 def test_an_interrupt_ends_the_workers(many, model, tmp_path, start_batch):
     out = tmp_path / "out"
     with unfinished(out, last_of(many)):
-        process = start_batch(many, out, model)
+        process = start_batch(many, out, model, jobs=1)
         wait_for_records(out, 1)
         children = processes_below(process.pid)
         os.kill(process.pid, signal.SIGINT)
@@ -164,7 +164,7 @@ def test_a_dask_cluster_that_loses_a_worker(many, model, tmp_path, start_batch):
     pytest.importorskip("distributed")
     out = tmp_path / "out"
     with unfinished(out, last_of(many)):
-        process = start_batch(many, out, model, "--dask", "local", "--tracks-only")
+        process = start_batch(many, out, model, "--dask", "local", "--tracks-only", jobs=1)
         wait_for_records(out, 1)
         os.kill(processes_below(process.pid)[0], signal.SIGKILL)
     code, printed, errors = finish(process)

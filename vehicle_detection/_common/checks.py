@@ -71,16 +71,14 @@ def check_type(value: object, name: str, kind: Any, remedy: str) -> None:
 def check_path(path: object, name: str = "path", *, kind: str = "a file name") -> Path:
     """Return a path, unless no file can have that name."""
     if not isinstance(path, (str, os.PathLike)):
-        raise InvalidInputError(f"{name} must be {kind}, got {describe(path)}; pass a path")
+        raise invalid(name, f"be {kind}", path, "pass a path")
     text = os.fspath(path)
     if not isinstance(text, str):
-        raise InvalidInputError(f"{name} must be {kind} as text, got {describe(path)}; use os.fsdecode")
+        raise invalid(name, f"be {kind} as text", path, "use os.fsdecode")
     try:
         too_long = len(os.fsencode(text)) > _MAX_PATH
     except UnicodeEncodeError:
-        raise InvalidInputError(
-            f"{name} must be {kind}, got {describe(path)} with a character that files cannot have"
-        ) from None
+        raise invalid(name, f"be {kind}", path, "drop the character that files cannot have") from None
     too_long |= any(len(os.fsencode(part)) > _MAX_NAME for part in Path(text).parts)
     if too_long or "\0" in text:
         problem = f"more than {_MAX_NAME} bytes" if too_long else "a null character"
@@ -280,27 +278,19 @@ def check_integer(value: object, name: str, *, low: int, high: int | None = None
     return int(value)  # type: ignore[call-overload, no-any-return]
 
 
-def check_choice(value: object, name: str, choices: Collection[object]) -> None:
-    """Raise unless `value` is one of `choices`."""
+def check_choice(value: Any, name: str, choices: Collection[object]) -> Any:
+    """Return `value` if it is one of `choices`."""
     if not (value is None or isinstance(value, (str, int, np.integer))) or value not in choices:
         listed = ", ".join(repr(choice) for choice in choices)
         raise InvalidInputError(f"{name} must be one of {listed}; got {describe(value)}")
+    return value
 
 
-def number(
-    default: Any = MISSING,
-    *,
-    low: float = -math.inf,
-    high: float = math.inf,
-    above: float = -math.inf,
-    optional: bool = False,
-) -> Any:
-    """Declare a number in ``[low, high]`` that is greater than `above`; if `optional`, it may be None."""
+def number(default: Any = MISSING, **bounds: float) -> Any:
+    """Declare a number in ``[low, high]`` that is greater than `above`."""
 
-    def check(value: Any, name: str) -> float | None:
-        if optional and value is None:
-            return None
-        found = check_number(value, name, low=low, high=high, above=above)
+    def check(value: Any, name: str) -> float:
+        found = check_number(value, name, **bounds)
         return value if type(value) in (int, float) else found  # a number of NumPy becomes a float
 
     return checked_field(default, check)
@@ -318,12 +308,7 @@ def flag(default: bool) -> Any:
 
 def choice(default: Any, choices: Collection[Any]) -> Any:
     """Declare one of several values."""
-
-    def check(value: Any, name: str) -> Any:
-        check_choice(value, name, choices)
-        return value
-
-    return checked_field(default, check)
+    return checked_field(default, lambda value, name: check_choice(value, name, choices))
 
 
 def checked_field(default: Any, check: Callable[[Any, str], Any]) -> Any:

@@ -7,15 +7,11 @@ import errno
 import logging
 import os
 import shutil
-import signal
 import stat
 import sys
 import tempfile
-import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 from vehicle_detection._common.checks import check_path
 from vehicle_detection.errors import InvalidInputError, OutputError, VehicleDetectionError
@@ -78,20 +74,20 @@ def atomic_write(target: str | os.PathLike[str], name: str = "target") -> Iterat
     path = check_target(target, name)
     if path.is_symlink() and path.exists():  # the link stays one
         path = path.resolve()
-    # Two stacks: an interrupt can end the first removal, even before it begins.
-    with contextlib.ExitStack() as stack, contextlib.ExitStack() as first:
-        with _output_errors(path, every=True), _uninterrupted():
-            part = _open_part(path, stack)
-            parts = [part]
-            for each in (stack, first):
-                each.callback(_remove, parts)
-        with _output_errors(path, part):
-            yield part
+    with contextlib.ExitStack() as stack:
         with _output_errors(path, every=True):
-            with contextlib.suppress(OSError):  # some file systems, such as exFAT, refuse it
-                part.chmod(_permissions(path))  # the temporary file is private
-            part.replace(path)
-            parts.clear()  # from now on, the name may be that of another process's file
+            part = _open_part(path, stack)
+        try:
+            with _output_errors(path, part):
+                yield part
+            with _output_errors(path, every=True):
+                with contextlib.suppress(OSError):  # some file systems, such as exFAT, refuse it
+                    part.chmod(_permissions(path))  # the temporary file is private
+                part.replace(path)
+        except BaseException:
+            with contextlib.suppress(OSError):  # the first error is the one to report
+                part.unlink()
+            raise
 
 
 def _permissions(path: Path) -> int:
@@ -103,40 +99,6 @@ def _permissions(path: Path) -> int:
     umask = os.umask(0)
     os.umask(umask)
     return 0o666 & ~umask
-
-
-@contextlib.contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Delay the handlers of signals, such as Ctrl-C, until the end of the block.
-
-    Python calls them in the main thread only; in another thread, the block runs as it is.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    handlers: dict[int, Any] = {}
-    arrived: list[tuple[int, FrameType | None]] = []
-    delayed = True
-
-    def delay(number: int, frame: FrameType | None) -> None:
-        if delayed:
-            arrived.append((number, frame))
-        else:  # an interrupt has come before another handler was restored
-            handlers[number](number, frame)
-
-    try:
-        for each in signal.valid_signals():
-            handler = signal.getsignal(each)
-            if callable(handler):  # neither ignored nor the default of the system
-                handlers[each] = handler
-                signal.signal(each, delay)
-        yield
-    finally:
-        delayed = False
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        for number, frame in arrived:
-            handlers[number](number, frame)
 
 
 @contextlib.contextmanager
@@ -223,14 +185,6 @@ def open_locked(part: Path) -> int | None:
         os.close(handle)
 
 
-def _remove(parts: list[Path]) -> None:
-    """Remove the file, and empty the list: its name may be used again by another process."""
-    if parts:
-        with contextlib.suppress(OSError):  # the first error is the one to report
-            parts[0].unlink()
-        parts.clear()
-
-
 def private_folder(name: str) -> str:
     """Create a folder for temporary files that only this user can write; empty if that is impossible.
 
@@ -256,25 +210,19 @@ def private_folder(name: str) -> str:
 def temporary_folder(parent: Path, name: str) -> Iterator[Path]:
     """Create a hidden folder in `parent`, removed after the block; also remove those of killed processes."""
     prefix, suffix = f".{name}.", ".part"
-    with contextlib.ExitStack() as stack, contextlib.ExitStack() as first:  # as in `atomic_write`
+    with contextlib.ExitStack() as stack:
         if sys.platform != "win32":
             for old in parent.iterdir():
                 if old.name.startswith(prefix) and old.name.endswith(suffix) and old.is_dir():
                     _remove_abandoned(old)
         locked = False
         while not locked:
-            with _output_errors(parent / name, every=True), _uninterrupted():
+            with _output_errors(parent / name, every=True):
                 folder = Path(tempfile.mkdtemp(prefix=prefix, suffix=suffix, dir=parent))
-                for each in (stack, first):
-                    each.callback(_remove_folder, folder)
+            stack.callback(shutil.rmtree, folder, ignore_errors=True)
             locked = sys.platform == "win32" or _keep_locked(folder, stack)
         with _output_errors(parent / name):
             yield folder
-
-
-def _remove_folder(folder: Path) -> None:
-    with _uninterrupted():  # an interrupted `rmtree` may close a file twice
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _keep_locked(folder: Path, stack: contextlib.ExitStack) -> bool:
@@ -304,5 +252,5 @@ def _lock_folder(folder: Path) -> int:
 def _remove_abandoned(folder: Path) -> None:
     with contextlib.suppress(OSError):  # in use
         handle = _lock_folder(folder)
-        _remove_folder(folder)
+        shutil.rmtree(folder, ignore_errors=True)
         os.close(handle)

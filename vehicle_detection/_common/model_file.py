@@ -56,13 +56,8 @@ def write_model(
         raise InvalidInputError(
             f"metadata must contain JSON values only: {error}; convert NumPy numbers with .item()"
         ) from error
-    header = {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        "kind": kind,
-        "params": json.dumps(dict(params), sort_keys=True),
-        "metadata": metadata_json,
-    }
+    header = {"format": FORMAT, "format_version": FORMAT_VERSION, "kind": kind}
+    header |= {"params": json.dumps(dict(params), sort_keys=True), "metadata": metadata_json}
     header["sha256"] = checksum(header, tensors)
     with atomic_write(path, "path") as part:
         part.write_bytes(_with_sorted_header(save(dict(tensors), metadata=header)))

@@ -208,7 +208,10 @@ def run_batch(
     check_flags(
         tracks_only=tracks_only, audio=audio, retry_failed=retry_failed, dry_run=dry_run, progress=progress
     )
-    _check_callables(executor, on_record)
+    if executor is not None and not hasattr(executor, "submit"):
+        raise invalid("executor", "be an executor of concurrent.futures", executor, "omit it")
+    if on_record is not None and not callable(on_record):
+        raise invalid("on_record", "be a function of a record", on_record)
     workers = available_cores() if jobs is None else check_integer(jobs, "jobs", low=1, high=1024)
     check_choice(preset, "preset", PRESETS)
     if executor is None and not dry_run:
