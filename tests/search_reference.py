@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_boxes, check_image
+from vehicle_detection._common import check
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
     PATCH_SIZE,
@@ -29,8 +29,8 @@ def score_windows(
     image: NDArray[np.uint8], windows: ArrayLike, classifier: VehicleClassifier
 ) -> NDArray[np.float64]:
     """Scores of 64x64 windows on the grid of HOG cells, ``(N,)``, with one HOG of the whole image."""
-    check_image(image)
-    boxes, cell = check_boxes(windows, "windows").astype(np.int64), classifier.params.pix_per_cell
+    check.image(image)
+    boxes, cell = check.boxes(windows, "windows").astype(np.int64), classifier.params.pix_per_cell
     if (boxes[:, 2:] - boxes[:, :2] != PATCH_SIZE).any() or (boxes[:, :2] % cell).any():
         raise InvalidInputError(
             f"windows must be {PATCH_SIZE}x{PATCH_SIZE} pixels, at multiples of {cell} pixels; resize the "

@@ -17,14 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import (
     UNITS,
     Checked,
-    check_bool,
-    check_boxes,
-    check_choice,
-    check_flags,
-    check_image,
-    check_number,
-    check_shape,
-    check_type,
+    check,
     checked_field,
     choice,
     describe,
@@ -75,7 +68,7 @@ def _check_labels(value: Any, name: str) -> tuple[str, ...]:
         raise invalid(name, "be a list of fields", value, f"pass some of {LABEL_FIELDS}")
     fields = (value,) if isinstance(value, str) else tuple(value)
     for field in fields:
-        check_choice(field, name, LABEL_FIELDS)
+        check.choice(field, name, LABEL_FIELDS)
     return fields
 
 
@@ -392,14 +385,14 @@ class Annotator:
         blur: Literal["vehicles", "plates"] | None = None,
         diagnostics: bool = False,
     ) -> None:
-        check_type(style, "style", DrawParams | None, "omit it for the default")
-        check_type(heat, "heat", HeatParams | None, "omit it for the default")
+        check.instance(style, "style", DrawParams | None, "omit it for the default")
+        check.instance(heat, "heat", HeatParams | None, "omit it for the default")
         if own_speed is not None and not callable(getattr(own_speed, "at", None)):
             got = describe(own_speed)
             raise InvalidInputError(f"own_speed must have a method at, got {got}; pass read_own_speed(...)")
         if blur is not None:
-            check_choice(blur, "blur", BLUR_REGIONS)
-        check_flags(diagnostics=diagnostics)
+            check.choice(blur, "blur", BLUR_REGIONS)
+        check.flags(diagnostics=diagnostics)
         self.style = style or DrawParams()
         self.camera, self.heat, self.own_speed = camera, heat, own_speed
         self.blur, self.diagnostics = blur, diagnostics
@@ -419,7 +412,7 @@ class Annotator:
 
     def reset(self, *, fps: float | None = None) -> None:
         """Forget all frames, before the first frame of another video; `fps` is for results without times."""
-        self._fps = _USUAL_FPS if fps is None else check_number(fps, "fps", above=0)
+        self._fps = _USUAL_FPS if fps is None else check.number(fps, "fps", above=0)
         self._placer = LabelPlacer()
         self._panel: BirdsEyePanel | None = None
         self._time = -math.inf
@@ -427,14 +420,14 @@ class Annotator:
 
     def output_shape(self, shape: tuple[int, ...]) -> tuple[int, int, int]:
         """Shape of a picture for frames of ``(height, width, ...)``; a view beside it adds columns."""
-        height, width = check_shape(shape)
+        height, width = check.shape(shape)
         beside = self.style.panel == "side" and not self.diagnostics
         return height, width + (BirdsEyePanel.side_size(shape)[1] if beside else 0), 3
 
     def draw(self, frame: Image, result: FrameResult) -> Image:
         """Draw a result on a copy of its ``(H, W, 3)`` uint8 RGB frame."""
-        check_image(frame, "frame")
-        check_type(result, "result", FrameResult, "pass what process or track returns")
+        check.image(frame, "frame")
+        check.instance(result, "result", FrameResult, "pass what process or track returns")
         if self.blur is not None:
             tracked = np.array([track.box for track in result.tracks]).reshape(-1, 4)
             frame = blur_boxes(frame, np.concatenate([tracked, result.detections.boxes]), region=self.blur)
@@ -451,9 +444,9 @@ class Annotator:
 
         If the frame was not searched, the boxes are dashed that were not detected in the last searched one.
         """
-        shape, style = check_image(image).shape, self.style
-        time = None if time is None else check_number(time, "time")
-        searched = check_bool(searched, "searched")
+        shape, style = check.image(image).shape, self.style
+        time = None if time is None else check.number(time, "time")
+        searched = check.boolean(searched, "searched")
         shown = sorted((track for track in _check_tracks(tracks) if track.shown), key=lambda track: track.id)
         own_mps = math.nan if self.own_speed is None or time is None else float(self.own_speed.at(time))
         if time is None or time < self._time:
@@ -555,15 +548,15 @@ def draw_diagnostics(
     (720, 1280, 3)
     """
     if params is not None:
-        check_type(params, "params", DrawParams, "omit it for the defaults")
-    checked = check_image(frame, "frame")
+        check.instance(params, "params", DrawParams, "omit it for the defaults")
+    checked = check.image(frame, "frame")
     height, width = (side // 2 for side in checked.shape[:2])
     if min(height, width) < 2:
         raise invalid("frame", "be at least 4x4 pixels", frame, "pass a larger image")
     # Draw at the panels' size, so that lines and text stay sharp.
     small = np.asarray(cv2.resize(checked, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     scale = np.array([width, height, width, height]) / np.array(checked.shape[:2] * 2)[[1, 0, 1, 0]]
-    boxes = check_boxes(windows)
+    boxes = check.boxes(windows)
     scaled = [dataclasses.replace(track, box=track.box * scale) for track in _check_tracks(tracks)]
     style = dataclasses.replace(params or DrawParams(), panel="none")
     panels = {

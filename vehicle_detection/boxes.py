@@ -15,21 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import (
-    Checked,
-    Floats,
-    check_array,
-    check_boxes,
-    check_choice,
-    check_integer,
-    check_number,
-    check_sequence,
-    check_shape,
-    describe,
-    invalid,
-    number,
-    pluralize,
-)
+from vehicle_detection._common import Checked, Floats, check, describe, invalid, number, pluralize
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -93,10 +79,10 @@ class Detections:
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        boxes, confidences = check_boxes(self.boxes), self.confidences
+        boxes, confidences = check.boxes(self.boxes), self.confidences
         scores = _score_column(self.scores, "scores", len(boxes))
         if confidences is not None:
-            given = check_array(confidences, "confidences")
+            given = check.array(confidences, "confidences")
             unknown = given.size and given.dtype.kind == "f" and np.isnan(given).all()
             confidences = None if unknown else _score_column(given, "confidences", len(boxes))
         if confidences is not None and not ((confidences >= 0) & (confidences <= 1)).all():
@@ -106,7 +92,7 @@ class Detections:
             )
         vars(self).update(boxes=boxes, scores=scores, confidences=confidences)
         if self.labels is not None:
-            labels = check_sequence(self.labels, "labels", "names of the classes of boxes")
+            labels = check.sequence(self.labels, "labels", "names of the classes of boxes")
             if len(labels) != len(boxes) or not all(isinstance(label, str) for label in labels):
                 raise invalid("labels", f"be a name for each of the {len(boxes)} boxes", self.labels)
             vars(self)["labels"] = np.array(labels, np.str_)
@@ -163,7 +149,7 @@ class Detections:
                 f"{describe(detections)}; pass a supervision.Detections, whose confidence may be None"
             )
         scale = check_score_scale(score, threshold)
-        boxes, confidence = check_boxes(detections.xyxy), _first_known(detections, "confidence", "conf")
+        boxes, confidence = check.boxes(detections.xyxy), _first_known(detections, "confidence", "conf")
         classes, data = _first_known(detections, "class_id", "cls"), getattr(detections, "data", None)
         extra = data if isinstance(data, dict) else {}
         scores = np.full(len(boxes), _CERTAIN_SCORE)
@@ -173,9 +159,9 @@ class Detections:
             scores = extra["score"]  # log-odds above the threshold of the model that found them
         labels = extra.get("class_name")
         if labels is None and names is not None and classes is not None:
-            labels = [str(names[int(each)]) for each in check_array(classes, "classes")]
+            labels = [str(names[int(each)]) for each in check.array(classes, "classes")]
         known = confidence if scale == "probability" else None
-        found = cls(boxes, scores, known, labels, None if classes is None else check_array(classes, "cls"))
+        found = cls(boxes, scores, known, labels, None if classes is None else check.array(classes, "cls"))
         return found if class_ids is None else select_classes(found, check_class_ids(class_ids))
 
     def to_pandas(self) -> pandas.DataFrame:
@@ -260,7 +246,7 @@ _COLUMNS = tuple(Detections.__dataclass_fields__)
 
 def _score_column(values: ArrayLike, name: str, count: int | None = None) -> Floats:
     """Return finite numbers as ``(N,)`` float64, one for each of `count` boxes."""
-    array = check_array(values, name)
+    array = check.array(values, name)
     if array.size == 0:
         array = array.reshape(-1).astype(np.float64)
     if array.ndim != 1 or array.dtype.kind not in "iuf" or (count is not None and len(array) != count):
@@ -279,8 +265,8 @@ def _first_known(detections: Any, *names: str) -> Any:
 
 def check_class_ids(class_ids: object) -> tuple[int, ...]:
     """Return the numbers of the classes to keep."""
-    ids = check_sequence(class_ids, "class_ids", "integers, such as (2, 5, 7)")
-    return tuple(check_integer(each, "class_ids", low=0) for each in ids)
+    ids = check.sequence(class_ids, "class_ids", "integers, such as (2, 5, 7)")
+    return tuple(check.integer(each, "class_ids", low=0) for each in ids)
 
 
 def select_classes(found: Detections, class_ids: Collection[int]) -> Detections:
@@ -346,8 +332,8 @@ def iou_matrix(first: Detections | ArrayLike, second: Detections | ArrayLike) ->
     >>> iou_matrix([[0, 0, 10, 10]], [[0, 0, 10, 10], [5, 0, 15, 10], [20, 20, 30, 30]]).round(2)
     array([[1.  , 0.33, 0.  ]])
     """
-    a = check_boxes(first, "first").astype(np.float64)
-    b = check_boxes(second, "second").astype(np.float64)
+    a = check.boxes(first, "first").astype(np.float64)
+    b = check.boxes(second, "second").astype(np.float64)
     return overlap_matrices(a, b)[0]
 
 
@@ -359,8 +345,8 @@ def clip_boxes(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> NDArray
     >>> clip_boxes([[-5, 10, 30, 60]], (50, 20, 3))
     array([[ 0, 10, 20, 50]])
     """
-    array = check_boxes(boxes)
-    height, width = check_shape(shape)
+    array = check.boxes(boxes)
+    height, width = check.shape(shape)
     limits = np.array([width, height, width, height])
     return np.asarray(np.clip(array, 0, limits), array.dtype)
 
@@ -406,8 +392,8 @@ def non_max_suppression(
     >>> non_max_suppression([[0, 0, 10, 10], [1, 0, 11, 10], [50, 0, 60, 10]], [0.5, 0.9, 0.1])
     array([1, 2])
     """
-    detections = Detections(check_boxes(boxes), check_array(scores, "scores"))
-    max_iou = check_number(threshold, "threshold", low=0, high=1)
+    detections = Detections(check.boxes(boxes), check.array(scores, "scores"))
+    max_iou = check.number(threshold, "threshold", low=0, high=1)
     return greedy_nms(detections.boxes.astype(np.float64), detections.scores, max_iou=max_iou)
 
 
@@ -442,17 +428,17 @@ def log_odds(scores: ArrayLike, score: ScoreScale, threshold: float | None = Non
 def check_score_scale(score: object, threshold: float | None) -> ScoreScale:
     """Return the scale of `log_odds` if it and the threshold are valid."""
     if isinstance(score, (tuple, list)) and len(score) == 2:
-        low = check_number(score[0], "score[0]")
+        low = check.number(score[0], "score[0]")
         if threshold is not None:
             raise InvalidInputError(
                 f"threshold must be omitted with score=(low, high): low is the threshold; got {threshold}"
             )
-        return low, check_number(score[1], "score[1]", above=low)
-    check_choice(score, "score", ("probability", "logit"))
+        return low, check.number(score[1], "score[1]", above=low)
+    check.choice(score, "score", ("probability", "logit"))
     if threshold is not None and score == "probability":
-        check_number(threshold, "threshold", above=0, high=0.999)
+        check.number(threshold, "threshold", above=0, high=0.999)
     elif threshold is not None:
-        check_number(threshold, "threshold")
+        check.number(threshold, "threshold")
     return score  # type: ignore[return-value]
 
 
@@ -472,7 +458,7 @@ class Platt(Checked):
 
     def probability(self, scores: ArrayLike) -> Floats:
         """Probability of a vehicle for each score, float64 in [0, 1], of the same shape."""
-        values = check_array(scores, "scores")
+        values = check.array(scores, "scores")
         if values.dtype.kind not in "iuf" or np.isnan(values).any():
             raise InvalidInputError(f"scores must be numbers without NaN; got {describe(scores)}")
         exponent = np.asarray(self.a * values.astype(np.float64) + self.b)
@@ -482,7 +468,7 @@ class Platt(Checked):
 
     def score(self, probability: float) -> float:
         """Return the score that has this probability, in (0, 1), for use as a threshold."""
-        value = check_number(probability, "probability", above=0)
+        value = check.number(probability, "probability", above=0)
         if value >= 1 or self.a == 0:
             raise InvalidInputError(
                 f"probability must lie in (0, 1) and a must not be 0; got {value:g} and a={self.a:g}"

@@ -26,14 +26,7 @@ from vehicle_detection._common import (
     Checked,
     Floats,
     Limit,
-    check_array,
-    check_boxes,
-    check_choice,
-    check_integer,
-    check_number,
-    check_path,
-    check_shape,
-    check_type,
+    check,
     checked_field,
     describe,
     flag,
@@ -152,7 +145,7 @@ class Camera(Checked):
     fisheye: bool = flag(False)
     k1: float = number(0.0, low=-1, high=1)
     k2: float = number(0.0, low=-1, high=1)
-    shape: FrameShape | None = checked_field(None, lambda value, _: check_shape(value))  # noqa: RUF009
+    shape: FrameShape | None = checked_field(None, lambda value, _: check.shape(value))  # noqa: RUF009
 
     @classmethod
     def for_frame(
@@ -183,14 +176,14 @@ class Camera(Checked):
             Other attributes of the class, such as ``focal_std=0.01`` for a calibrated lens. `k1` and `k2`
             must keep the radius positive up to the edge of the field of view.
         """
-        height, width = check_shape(shape)
+        height, width = check.shape(shape)
         # The default is about 400/720, the horizon of the course's video.
-        horizon = check_number(horizon, "horizon", low=-10, high=10)
+        horizon = check.number(horizon, "horizon", low=-10, high=10)
         if lens is not None:
-            check_choice(lens, "lens", LENSES)
+            check.choice(lens, "lens", LENSES)
             fov, fisheye = LENSES[lens]
             known = {"fisheye": fisheye} | known
-        angle = check_number(fov, "fov", low=1, high=170)
+        angle = check.number(fov, "fov", low=1, high=170)
         derived = {"focal_px": "fov", "horizon_px": "horizon"}
         unknown = sorted(known.keys() - cls.__dataclass_fields__.keys() | known.keys() & derived.keys())
         if unknown:
@@ -199,7 +192,7 @@ class Camera(Checked):
                 f"pass {derived.get(unknown[0], 'an attribute of Camera')}, or build Camera(...)"
             )
         half = math.radians(angle) / 2
-        k1, k2 = (check_number(known.get(name, 0.0), name, low=-1, high=1) for name in ("k1", "k2"))
+        k1, k2 = (check.number(known.get(name, 0.0), name, low=-1, high=1) for name in ("k1", "k2"))
         radius = float(_fisheye_radius(np.array(half), k1, k2)) if known.get("fisheye") else math.tan(half)
         if radius <= 0:
             raise InvalidInputError(
@@ -235,7 +228,7 @@ class Camera(Checked):
         elif fov is not None:
             known = {"fov": fov, "focal_std": _GIVEN_LENS_STD}
         if height_m is not None:
-            height = check_number(height_m, "height_m", above=0, high=100)
+            height = check.number(height_m, "height_m", above=0, high=100)
             known |= {"height_m": height, "height_std_m": _GIVEN_HEIGHT_STD}
         camera = dataclasses.replace(cls.for_frame(_REFERENCE_SHAPE, **known), shape=None)
         if horizon is None:
@@ -245,9 +238,9 @@ class Camera(Checked):
     def with_horizon(self, horizon: float, std: float = _GIVEN_HORIZON_STD) -> Camera:
         """Return the camera with another horizon and standard error, as fractions of the frame's height."""
         height = (self.shape or _REFERENCE_SHAPE)[0]
-        row = check_number(horizon, "horizon", low=0, high=1) * height
+        row = check.number(horizon, "horizon", low=0, high=1) * height
         return dataclasses.replace(
-            self, horizon_px=row, horizon_std_px=check_number(std, "std", low=0) * height
+            self, horizon_px=row, horizon_std_px=check.number(std, "std", low=0) * height
         )
 
     def for_shape(self, shape: tuple[int, ...]) -> Camera:
@@ -258,7 +251,7 @@ class Camera(Checked):
         >>> round(Camera.for_frame((720, 1280)).for_shape((360, 640)).horizon_px, 1)
         201.6
         """
-        size = check_shape(shape)
+        size = check.shape(shape)
         if self.shape == size:
             return self
         height, width = self.shape or _REFERENCE_SHAPE
@@ -310,7 +303,7 @@ class Camera(Checked):
         A vehicle in another lane shows its side too. Its box starts with the near face at the outer edge and
         ends with the far end of the side at the inner edge, `lateral_px` from the middle of the frame.
         """
-        lateral = check_array(lateral_px, "lateral_px")
+        lateral = check.array(lateral_px, "lateral_px")
         if lateral.dtype.kind not in "iuf":
             raise InvalidInputError(f"lateral_px must be numbers of pixels; got {describe(lateral_px)}")
         return np.asarray(self.focal_px * self.vehicle_width_m + self.vehicle_length_m * lateral)
@@ -326,7 +319,7 @@ class Camera(Checked):
         >>> camera.rectify_boxes(np.array([[900.0, 400, 1100, 520]]), (720, 1280)).round()
         array([[ 920.,  405., 1219.,  547.]])
         """
-        boxes = check_boxes(boxes)
+        boxes = check.boxes(boxes)
         if not self.fisheye or not len(boxes):
             return boxes
         camera = self.for_shape(shape)
@@ -400,12 +393,12 @@ def open_camera(
         lens = None if camera is None else str(camera)
         return Camera.dashcam(fov=fov, height_m=height_m, horizon=horizon, lens=lens)
     if not isinstance(camera, Camera):
-        check_type(camera, "camera", (Camera, str, os.PathLike), "omit it for the default")
+        check.instance(camera, "camera", (Camera, str, os.PathLike), "omit it for the default")
         if not os.path.isfile(camera):  # type: ignore[arg-type]
             raise invalid("camera", f"be a Camera, a file or one of {', '.join(LENSES)}", camera, "omit it")
         camera = read_camera(camera)  # type: ignore[arg-type]
         if height_m is not None:
-            height = check_number(height_m, "height_m", above=0, high=100)
+            height = check.number(height_m, "height_m", above=0, high=100)
             camera = dataclasses.replace(camera, height_m=height, height_std_m=_GIVEN_HEIGHT_STD)
     return camera if horizon is None else camera.with_horizon(horizon)
 
@@ -419,8 +412,8 @@ def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int,
     >>> round(read_camera(file).for_shape((360, 640)).focal_px)
     320
     """
-    check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
-    height, width = check_shape((camera.shape or _REFERENCE_SHAPE) if shape is None else shape)
+    check.instance(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
+    height, width = check.shape((camera.shape or _REFERENCE_SHAPE) if shape is None else shape)
     values = {"image_size": [width, height], **dataclasses.asdict(camera.for_shape((height, width)))}
     del values["shape"]
     write_text(path, json.dumps(values, indent=2) + "\n", "path")
@@ -446,7 +439,7 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
     >>> round(camera.focal_px), camera.height_m
     (598, 1.4)
     """
-    path = check_path(path)
+    path = check.path(path)
     values = _read_values(path)
     if "camera_matrix" in values or path.suffix.lower() in _CALIBRATIONS:
         return _from_calibration(path, values)
@@ -460,7 +453,7 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
     try:
         shape = _REFERENCE_SHAPE
         if size is not None:
-            shape = check_integer(size[1], "image_size", low=1), check_integer(size[0], "image_size", low=1)
+            shape = check.integer(size[1], "image_size", low=1), check.integer(size[0], "image_size", low=1)
         if "horizon" not in values and "horizon_px" not in values:
             values = {"horizon": _HORIZON, "horizon_std_px": _HORIZON_STD * shape[0]} | values
         if "focal_px" not in values and "lens" not in values:

@@ -18,12 +18,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import (
     Closing,
     available_cores,
-    check_bool,
-    check_choice,
-    check_image,
-    check_number,
-    check_path,
-    check_type,
+    check,
     describe,
     invalid,
     pluralize,
@@ -98,10 +93,10 @@ def load_model(
     >>> load_model("highway").params.color_space
     'LAB'
     """
-    file = check_path(path, kind="a model file, 'default' or 'highway'")
+    file = check.path(path, kind="a model file, 'default' or 'highway'")
     if str(path) == "default" or file.suffix.lower() in _NETWORK_SUFFIXES:
         return load_network(os.fspath(path), classes=classes, device=device)
-    check_choice(device, "device", ("cpu", "cuda"))
+    check.choice(device, "device", ("cpu", "cuda"))
     for name, value in ("classes", classes), ("device", None if device == "cpu" else device):
         if value is not None:
             raise invalid(name, f"be omitted for {str(path)!r}, which is no network", value)
@@ -178,8 +173,8 @@ class Detector(Closing):
     ) -> None:
         self.model = _check_model(model)
         kind, remedy = self.model.search_params_type, "omit it for the default"
-        check_type(search_params, "search_params", kind | None, remedy)
-        check_type(region_params, "region_params", RegionParams | HeatParams | None, remedy)
+        check.instance(search_params, "search_params", kind | None, remedy)
+        check.instance(region_params, "region_params", RegionParams | HeatParams | None, remedy)
         if conf is not None:
             region_params = self._set_confidence(conf, region_params)
         self.camera = open_camera(camera)
@@ -194,7 +189,7 @@ class Detector(Closing):
         if isinstance(region_params, HeatParams):
             self.heat_params = region_params = region_params.for_search(self.search_params)
         self.region_params = region_params or RegionParams()
-        self.low_score = check_number(low_score, "low_score", high=0)
+        self.low_score = check.number(low_score, "low_score", high=0)
         self._jobs = jobs
         self._search = self.model.open_search(jobs)
         self._cameras: dict[tuple[int, int], Camera] = {}
@@ -236,7 +231,7 @@ class Detector(Closing):
 
     def fit(self, found: SearchResult) -> Detections:
         """Return the vehicles of a search with confidences, including scores below 0."""
-        check_type(found, "found", SearchResult, "pass what search returns")
+        check.instance(found, "found", SearchResult, "pass what search returns")
         return self._fit(found, self.region_params)
 
     def _fit(self, found: SearchResult, regions: RegionParams | HeatParams) -> Detections:
@@ -306,7 +301,7 @@ class Detector(Closing):
 
 def _check_confidence(conf: object, regions: RegionParams | HeatParams | None) -> float:
     """Return a minimum confidence within the range that a calibration can tell apart."""
-    limit = min(max(check_number(conf, "conf", low=0, high=1), _MIN_CONF), _MAX_CONF)
+    limit = min(max(check.number(conf, "conf", low=0, high=1), _MIN_CONF), _MAX_CONF)
     if isinstance(regions, HeatParams):
         raise InvalidInputError(
             f"conf must be None with a heat map, whose heat is no probability; got {conf:g}; set the "
@@ -403,8 +398,8 @@ class VehicleDetector(Closing):
         annotator: Annotator | None = None,
         jobs: int | None = None,
     ) -> None:
-        check_type(track_params, "track_params", TrackParams | None, "omit it for the default")
-        check_type(annotator, "annotator", Annotator | None, "omit it for the default")
+        check.instance(track_params, "track_params", TrackParams | None, "omit it for the default")
+        check.instance(annotator, "annotator", Annotator | None, "omit it for the default")
         self.track_params = track_params or TrackParams()
         options: dict[str, Any] = {"conf": conf, "search_params": search_params, "camera": camera}
         options |= {"region_params": region_params, "jobs": jobs}
@@ -423,7 +418,7 @@ class VehicleDetector(Closing):
 
     def reset(self, *, fps: float | None = None) -> None:
         """Forget all frames, before another video; `fps` is for frames without times, 25 if unknown."""
-        self._fps = None if fps is None else check_number(fps, "fps", above=0, high=1e6)
+        self._fps = None if fps is None else check.number(fps, "fps", above=0, high=1e6)
         self.tracker = Tracker(
             self.track_params,
             camera=self.camera,
@@ -499,8 +494,8 @@ class VehicleDetector(Closing):
         """
         with self._one_thread:
             start, time = clock.thread_time(), _check_time(time)
-            shape = check_image(frame, "frame").shape
-            found = self._search_next(frame) if check_bool(search, "search") else None
+            shape = check.image(frame, "frame").shape
+            found = self._search_next(frame) if check.boolean(search, "search") else None
             cut = self._cuts.update(frame)
             if found is None and not cut and self.tracker.follows(shape, time):
                 self._skipped += 1
@@ -524,9 +519,9 @@ class VehicleDetector(Closing):
         of frames since the last one, of which the others were not searched. A `cut` to another scene
         (`tracking.SceneCuts`) ends all tracks.
         """
-        check_type(found, "found", SearchResult, "pass what search returns")
+        check.instance(found, "found", SearchResult, "pass what search returns")
         with self._one_thread:
-            return self._track(found, _check_time(time), frames, check_bool(cut, "cut"))
+            return self._track(found, _check_time(time), frames, check.boolean(cut, "cut"))
 
     def _track(self, found: SearchResult, time: float | None, frames: int, cut: bool) -> FrameResult:
         start, heat_params = clock.thread_time(), self.detector.heat_params
@@ -587,4 +582,4 @@ class VehicleDetector(Closing):
 
 
 def _check_time(time: object) -> float | None:
-    return None if time is None else check_number(time, "time", low=-1e12, high=1e12)
+    return None if time is None else check.number(time, "time", low=-1e12, high=1e12)

@@ -16,18 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import (
-    Floats,
-    check_array,
-    check_boxes,
-    check_choice,
-    check_flags,
-    check_image,
-    check_integer,
-    check_type,
-    describe,
-    invalid,
-)
+from vehicle_detection._common import Floats, check, describe, invalid
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tracking import Track
@@ -406,19 +395,19 @@ def draw_boxes(
     >>> drawn[5, 10].tolist(), drawn[24, 29].tolist(), int(drawn.any(axis=2).sum())
     ([0, 0, 255], [0, 0, 255], 76)
     """
-    result = check_image(image).copy()
+    result = check.image(image).copy()
     rgb = _check_color(color)
-    width = check_integer(thickness, "thickness", low=1, high=10_000)
-    for box in check_boxes(boxes):
+    width = check.integer(thickness, "thickness", low=1, high=10_000)
+    for box in check.boxes(boxes):
         draw_outline(result, round_box(box), rgb, width)
     return result
 
 
 def _check_color(color: Color) -> Color:
     """Return a color as Python's integers, which OpenCV needs."""
-    if check_array(color, "color").shape != (3,):
+    if check.array(color, "color").shape != (3,):
         raise InvalidInputError(f"color must be (red, green, blue), 0-255 each; got {describe(color)}")
-    red, green, blue = (check_integer(value, "color", low=0, high=255) for value in color)
+    red, green, blue = (check.integer(value, "color", low=0, high=255) for value in color)
     return red, green, blue
 
 
@@ -454,11 +443,11 @@ def draw_detections(
     >>> np.argwhere(drawn.any(axis=2)).min(axis=0).tolist()
     [40, 40]
     """
-    check_type(detections, "detections", Detections, "pass what detect returns")
-    shape = check_image(image).shape
-    check_flags(scores=scores)
+    check.instance(detections, "detections", Detections, "pass what detect returns")
+    shape = check.image(image).shape
+    check.flags(scores=scores)
     if line_width is not None:
-        check_integer(line_width, "line_width", low=1, high=1000)
+        check.integer(line_width, "line_width", low=1, high=1000)
     width = line_width or line_width_for(shape)
     result = draw_boxes(image, detections.boxes, color=color, thickness=width)
     if scores:
@@ -510,10 +499,10 @@ def blur_boxes(
     >>> bool(blurred[20:40, 30:50].std() < 0.3 * image.std()), bool((blurred[:, :10] == image[:, :10]).all())
     (True, True)
     """
-    result = check_image(image).copy()
-    check_choice(region, "region", BLUR_REGIONS)
+    result = check.image(image).copy()
+    check.choice(region, "region", BLUR_REGIONS)
     height, width = result.shape[:2]
-    for x1, y1, x2, y2 in _regions(check_boxes(boxes).astype(np.float64), region).tolist():
+    for x1, y1, x2, y2 in _regions(check.boxes(boxes).astype(np.float64), region).tolist():
         left, top = max(int(np.floor(x1)), 0), max(int(np.floor(y1)), 0)
         right, bottom = min(int(np.ceil(x2)), width), min(int(np.ceil(y2)), height)
         if right > left and bottom > top:
@@ -553,8 +542,8 @@ def draw_cell_shares(image: Image, window: ArrayLike, cells: NDArray[Any]) -> Im
     Orange cells raise the score and blue ones lower it, the stronger the more. `window` is
     ``[x1, y1, x2, y2]`` in pixels, and `cells` are ``(rows, columns)``.
     """
-    result = check_image(image).copy()
-    x1, y1, x2, y2 = check_boxes([window], "window")[0].astype(np.float64).tolist()
+    result = check.image(image).copy()
+    x1, y1, x2, y2 = check.boxes([window], "window")[0].astype(np.float64).tolist()
     rows, columns = cells.shape
     peak = float(np.abs(cells).max()) or 1.0
     xs, ys = np.linspace(x1, x2, columns + 1).round(), np.linspace(y1, y2, rows + 1).round()
@@ -567,7 +556,7 @@ def draw_cell_shares(image: Image, window: ArrayLike, cells: NDArray[Any]) -> Im
 
 def heat_image(heat: NDArray[Any]) -> Image:
     """Color an ``(h, w)`` heat map from black (0) to yellow (its maximum), as ``(h, w, 3)`` uint8 RGB."""
-    values = check_array(heat, "heat")
+    values = check.array(heat, "heat")
     if values.ndim != 2 or not values.size or values.dtype.kind not in "iufb":
         raise invalid("heat", "be an (h, w) array of numbers", heat, "pass a heat map")
     values = values.astype(np.float32)

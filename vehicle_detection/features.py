@@ -20,11 +20,7 @@ from numpy.typing import NDArray
 from vehicle_detection import _kernels as kernels
 from vehicle_detection._common import (
     Checked,
-    check_choice,
-    check_image,
-    check_integer,
-    check_patches,
-    check_type,
+    check,
     checked_field,
     choice,
     describe,
@@ -51,7 +47,7 @@ def _check_spatial_size(size: Any, name: str) -> int:
     """Return an integer; a pair of equal numbers is accepted too."""
     if isinstance(size, (tuple, list)) and len(size) == 2 and size[0] == size[1]:
         size = size[0]
-    return check_integer(size, name, low=1, high=PATCH_SIZE)
+    return check.integer(size, name, low=1, high=PATCH_SIZE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,9 +121,9 @@ class FeatureParams(Checked):
             object.__setattr__(self, name, float(getattr(self, name)))
         if not (self.spatial_feat or self.hist_feat or self.hog_feat):
             raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; set one to True")
-        check_integer(self.cell_per_block, "cell_per_block", low=1, high=self.cells)
+        check.integer(self.cell_per_block, "cell_per_block", low=1, high=self.cells)
         if not isinstance(self.hog_channel, str):  # 1.0 and True are equal to 1
-            object.__setattr__(self, "hog_channel", check_integer(self.hog_channel, "hog_channel", low=0))
+            object.__setattr__(self, "hog_channel", check.integer(self.hog_channel, "hog_channel", low=0))
         if self.coarse_hog and self.cells // 2 < self.cell_per_block:
             raise InvalidInputError(
                 f"coarse_hog must be False, because a block of {self.cell_per_block} cells of "
@@ -137,7 +133,7 @@ class FeatureParams(Checked):
     @classmethod
     def preset(cls, name: str) -> FeatureParams:
         """Parameters by name: of three course projects, or ``"lab-9432"`` of the shipped model "highway"."""
-        check_choice(name, "preset", cls.PRESETS)
+        check.choice(name, "preset", cls.PRESETS)
         return cls(**cls.PRESETS[name])
 
     def spatial_planes(self, values: NDArray[Any]) -> NDArray[Any]:
@@ -242,9 +238,9 @@ def convert_color(image: NDArray[np.uint8], color_space: str = "YCrCb") -> NDArr
     >>> convert_color(np.full((1, 1, 3), 200, np.uint8), "YCrCb").tolist()
     [[[200, 128, 128]]]
     """
-    check_image(image)
+    check.image(image)
     space = str(color_space).removeprefix("RGB2")
-    check_choice(space, "color_space", COLOR_SPACES)
+    check.choice(space, "color_space", COLOR_SPACES)
     if space == "RGB":
         return image.copy()
     return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_RGB2{space}")), np.uint8)
@@ -299,7 +295,7 @@ def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None =
     (2384,)
     """
     params = _check_params(params)
-    check_patches([image], PATCH_SIZE, "image")
+    check.patches([image], PATCH_SIZE, "image")
     spatial, hist = (convert_color(image, space) for space in (params.spatial_space, params.hist_space))
     parts = color_parts(spatial, hist, params)
     if params.hog_feat:
@@ -422,13 +418,13 @@ def read_patches(source: Any, name: str) -> NDArray[np.uint8]:
         )
     if not isinstance(source, np.ndarray) or (source.ndim == 1 and source.dtype.kind in "UO"):
         source = [read_image(item) if isinstance(item, (str, os.PathLike)) else item for item in source]
-    return check_patches(source, PATCH_SIZE, name)
+    return check.patches(source, PATCH_SIZE, name)
 
 
 def _check_params(params: FeatureParams | None) -> FeatureParams:
     if params is None:
         return FeatureParams()
-    check_type(params, "params", FeatureParams, "pass FeatureParams(...) or FeatureParams.preset(...)")
+    check.instance(params, "params", FeatureParams, "pass FeatureParams(...) or FeatureParams.preset(...)")
     return params
 
 

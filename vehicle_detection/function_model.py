@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Checked, check_bool, check_type, describe, invalid, number
+from vehicle_detection._common import Checked, check, describe, invalid, number
 from vehicle_detection.boxes import (
     Detections,
     Platt,
@@ -73,8 +73,8 @@ class FunctionModel:
             raise invalid(
                 "function", "be a function of an image", self.function, "it returns boxes and scores"
             )
-        vars(self)["thread_safe"] = check_bool(self.thread_safe, "thread_safe")
-        check_type(self.name, "name", str | None, "omit it for the function's name")
+        vars(self)["thread_safe"] = check.boolean(self.thread_safe, "thread_safe")
+        check.instance(self.name, "name", str | None, "omit it for the function's name")
         lock = self._lock
         if self.thread_safe:
             lock = contextlib.nullcontext()

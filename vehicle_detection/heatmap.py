@@ -14,19 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import (
-    Checked,
-    check_array,
-    check_boxes,
-    check_integer,
-    check_number,
-    check_shape,
-    check_type,
-    choice,
-    integer,
-    invalid,
-    number,
-)
+from vehicle_detection._common import Checked, check, choice, integer, invalid, number
 from vehicle_detection.boxes import Detections, clip_boxes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.search import SearchParams
@@ -147,8 +135,8 @@ def add_heat(heatmap: Heat, boxes: Detections | ArrayLike, *, scores: ArrayLike 
            [1., 1., 0., 0.]])
     """
     heat = _check_heat(heatmap, in_place=True)
-    windows = check_boxes(boxes)
-    given = np.ones(len(windows)) if scores is None else check_array(scores, "scores")
+    windows = check.boxes(boxes)
+    given = np.ones(len(windows)) if scores is None else check.array(scores, "scores")
     weights = Detections(windows, given).scores
     windows = clip_boxes(np.rint(windows), heat.shape).astype(np.int64)
     if not len(windows):
@@ -191,7 +179,7 @@ def apply_threshold(heatmap: Heat, threshold: float) -> Heat:
     (True, [[0.0, 0.0, 3.0]])
     """
     heat = _check_heat(heatmap, in_place=True)
-    heat[heat <= check_number(threshold, "threshold")] = 0
+    heat[heat <= check.number(threshold, "threshold")] = 0
     return heatmap
 
 
@@ -212,8 +200,8 @@ def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, peak_fraction:
     ([[1, 1, 4, 2]], [[2, 1, 4, 2]])
     """
     heat = _check_heat(heatmap)
-    peak_fraction = check_number(peak_fraction, "peak_fraction", low=0, high=0.99)
-    labels, stats = _connected_components(heat > check_number(threshold, "threshold", low=0))
+    peak_fraction = check.number(peak_fraction, "peak_fraction", low=0, high=0.99)
+    labels, stats = _connected_components(heat > check.number(threshold, "threshold", low=0))
     boxes, peaks = [], []
     # From top to bottom, because OpenCV labels components by blocks of two rows and columns.
     for label in (1 + np.lexsort((stats[1:, 0], stats[1:, 1]))).tolist():
@@ -254,12 +242,12 @@ def bounding_boxes(shape: tuple[int, ...], windows: Any, *, params: HeatParams |
     [[0, 0, 12, 8]]
     """
     params = HeatParams() if params is None else params
-    check_type(params, "params", HeatParams, "omit it for the default")
+    check.instance(params, "params", HeatParams, "omit it for the default")
     if params.weighting == "count" and not isinstance(windows, Detections):
-        boxes = check_boxes(windows, "windows")
+        boxes = check.boxes(windows, "windows")
         windows = Detections(boxes, np.ones(len(boxes)))
     remedy = 'pass Detections(boxes, scores), or HeatParams(weighting="count") for boxes without scores'
-    check_type(windows, "windows", Detections, remedy)
+    check.instance(windows, "windows", Detections, remedy)
     return label_heat(frame_heat(shape, windows, params), params)
 
 
@@ -278,7 +266,7 @@ def label_heat(heatmap: NDArray[Any], params: HeatParams) -> Detections:
 def frame_heat(shape: tuple[int, ...], windows: Detections, params: HeatParams) -> NDArray[np.float32]:
     """Heat of one frame's windows, ``(H, W)`` float32, weighted as `params` say."""
     scores = windows.scores.clip(0) if params.weighting == "score" else None
-    return add_heat(np.zeros(check_shape(shape), np.float32), windows.boxes, scores=scores)
+    return add_heat(np.zeros(check.shape(shape), np.float32), windows.boxes, scores=scores)
 
 
 class HeatHistory:
@@ -293,7 +281,7 @@ class HeatHistory:
     """
 
     def __init__(self, frames: int = 5) -> None:
-        self._maps: deque[NDArray[np.float32]] = deque(maxlen=check_integer(frames, "frames", low=1))
+        self._maps: deque[NDArray[np.float32]] = deque(maxlen=check.integer(frames, "frames", low=1))
 
     def add(self, heatmap: NDArray[Any]) -> NDArray[np.float32]:
         """Add ``(H, W)`` heat and return the mean, float32; another size clears the history first."""

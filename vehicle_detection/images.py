@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import (
     Limit,
     atomic_write,
-    check_image,
-    check_path,
+    check,
     download_bytes,
     hide_credentials,
     invalid,
@@ -149,7 +148,7 @@ def read_image(path: str | os.PathLike[str] | bytes) -> NDArray[np.uint8]:
         raise invalid("path", "be a file name or bytes", path, "pass bytes(...) or stream.getvalue()")
     if isinstance(path, str) and is_url(path := local_path(path)):
         return decode_image(download_bytes(path, Limit.IMAGE_BYTES), f"image {hide_credentials(path)}")
-    name = f"image file {(file := check_path(path))}"
+    name = f"image file {(file := check.path(path))}"
     return decode_image(read_regular_file(file, name, Limit.IMAGE_BYTES), name)
 
 
@@ -161,7 +160,7 @@ def image_array(image: Any) -> NDArray[np.uint8]:
         from PIL.ImageOps import exif_transpose
 
         return np.array(exif_transpose(image).convert("RGB"), np.uint8)
-    return check_image(image)
+    return check.image(image)
 
 
 def list_images(source: Any) -> Sequence[Any] | None:
@@ -173,7 +172,7 @@ def list_images(source: Any) -> Sequence[Any] | None:
         return source
     if not isinstance(source, (str, os.PathLike)) or (isinstance(source, str) and is_url(source)):
         return None
-    path = check_path(source)
+    path = check.path(source)
     if path.is_dir():
         files = [Path(folder, name) for folder, _, names in os.walk(path) for name in names]
     elif not path.exists() and glob.has_magic(str(path)):
@@ -198,8 +197,8 @@ def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
     ...     read_image(f"{folder}/black.png").shape
     (4, 6, 3)
     """
-    rgb = check_image(image)
-    check_path(path)
+    rgb = check.image(image)
+    check.path(path)
     if not cv2.haveImageWriter(f"image{Path(path).suffix}"):
         raise InvalidInputError(
             f"path must end in .png, .jpg or another image suffix, got {Path(path).name!r}"

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Checked, Floats, check_shape, check_type, number
+from vehicle_detection._common import Checked, Floats, check, number
 from vehicle_detection.boxes import Detections, box_areas, clip_boxes, intersection_matrix, overlap_matrices
 from vehicle_detection.camera import Camera
 
@@ -96,10 +96,10 @@ def find_vehicles(
     >>> find_vehicles(windows, camera, (720, 1280)).boxes.round().astype(int)
     array([[608, 385, 676, 448]])
     """
-    check_type(windows, "windows", Detections, "pass Detections(boxes, scores)")
-    check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
-    check_type(params, "params", RegionParams | None, "omit it for the default")
-    params, frame = params or RegionParams(), check_shape(shape)
+    check.instance(windows, "windows", Detections, "pass Detections(boxes, scores)")
+    check.instance(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
+    check.instance(params, "params", RegionParams | None, "omit it for the default")
+    params, frame = params or RegionParams(), check.shape(shape)
     return fit_boxes(group_windows(windows, params), camera.for_shape(frame), frame, params)
 
 

@@ -36,10 +36,7 @@ from vehicle_detection._common import (
     Closing,
     ThreadTeam,
     Workspace,
-    check_choice,
-    check_image,
-    check_number,
-    check_type,
+    check,
     checked_field,
     describe,
     number,
@@ -59,14 +56,14 @@ Pair = tuple[float, float]
 
 
 def _pair(*, low: float, high: float) -> Callable[[Any, str], Pair]:
-    def check(value: Any, name: str) -> Pair:
+    def pair(value: Any, name: str) -> Pair:
         if not isinstance(value, tuple) or len(value) != 2:
             raise InvalidInputError(f"{name} must be a pair of numbers, got {describe(value)}")
         for index, each in enumerate(value):
-            check_number(each, f"{name}[{index}]", low=low, high=high)
+            check.number(each, f"{name}[{index}]", low=low, high=high)
         return value
 
-    return check
+    return pair
 
 
 def _check_bands(bands: Any, name: str) -> tuple[SearchBand, ...]:
@@ -186,7 +183,7 @@ class SearchParams(Checked):
         (docs/results.md).
         """
         presets = {"three-scales": _three_scales, "130-windows": _window_list, "default": _default_bands}
-        check_choice(name, "preset", presets)
+        check.choice(name, "preset", presets)
         return presets[name]()
 
     def with_horizon(self, horizon: float | None) -> SearchParams:
@@ -308,10 +305,10 @@ class FrameSearch(Closing, ABC):
             Minimum score of a vehicle, without effect if vehicles are derived from the windows.
         """
         start = time.perf_counter()
-        height, width, _ = check_image(frame, "frame").shape
+        height, width, _ = check.image(frame, "frame").shape
         params = self.params_type.default() if params is None else params
-        check_type(params, "params", self.params_type, "omit it for the default")
-        min_score = check_number(min_vehicle_score, "min_vehicle_score")
+        check.instance(params, "params", self.params_type, "omit it for the default")
+        min_score = check.number(min_vehicle_score, "min_vehicle_score")
         windows, vehicles = self._search(frame, params, min_score)
         return SearchResult(windows, vehicles, (height, width), time.perf_counter() - start)
 
@@ -342,8 +339,8 @@ class BandSearch(FrameSearch):
 
     def find_windows(self, image: NDArray[np.uint8], params: SearchParams) -> Detections:
         """Windows of all bands that score above ``params.min_score``."""
-        check_image(image)
-        check_type(params, "params", SearchParams, 'pass SearchParams.preset("default")')
+        check.image(image)
+        check.instance(params, "params", SearchParams, 'pass SearchParams.preset("default")')
         bands = params.place(image.shape)
         cell, min_score = self.filters.params.pix_per_cell, float(params.min_score)
         with single_threaded_opencv():

@@ -14,10 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
     Floats,
-    check_array,
-    check_patches,
-    check_sequence,
-    check_type,
+    check,
     describe,
     invalid,
     pluralize,
@@ -112,12 +109,12 @@ class VehicleClassifier:
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_type(self.params, "params", FeatureParams, CLASSIFIER_REMEDY)
-        object.__setattr__(self, "templates", check_sequence(self.templates, "templates", "Template"))
+        check.instance(self.params, "params", FeatureParams, CLASSIFIER_REMEDY)
+        object.__setattr__(self, "templates", check.sequence(self.templates, "templates", "Template"))
         if not self.templates:
             raise InvalidInputError("templates must hold at least one template; got none")
         for template in self.templates:
-            check_type(template, "templates", Template, CLASSIFIER_REMEDY)
+            check.instance(template, "templates", Template, CLASSIFIER_REMEDY)
             if template.coef.shape != (self.params.length,):
                 raise InvalidInputError(
                     f"templates must have {self.params.length} weights, the length of the features; "
@@ -152,16 +149,16 @@ class VehicleClassifier:
 
     def score(self, X: ArrayLike, y: ArrayLike) -> float:
         """Accuracy, 0 to 1, for ``(N,)`` labels `y`, 1 for a vehicle; `X` as in `decision_function`."""
-        labels, predicted = check_array(y, "y"), self.predict(X)
+        labels, predicted = check.array(y, "y"), self.predict(X)
         if labels.shape != predicted.shape or not labels.size:
             raise invalid("y", f"hold one label for each of {len(predicted)} rows (at least one)", labels)
         return float(np.mean(predicted == labels))
 
     def _features_of(self, X: ArrayLike) -> NDArray[Any]:
         """Check feature vectors, or extract those of patches: ``(N, length)``."""
-        array = check_array(X, "X")
+        array = check.array(X, "X")
         if array.ndim == 4:
-            return extract_features(check_patches(array, PATCH_SIZE, "X"), self.params)
+            return extract_features(check.patches(array, PATCH_SIZE, "X"), self.params)
         if array.ndim != 2 or array.shape[1] != self.params.length or array.dtype.kind not in "iuf":
             raise invalid("X", f"be (N, {self.params.length}) features or (N, 64, 64, 3) patches", array)
         if not np.isfinite(array).all():
@@ -209,7 +206,7 @@ class VehicleClassifier:
         known, steps = split_pipeline(pipeline)
         params = known if params is None else params
         if metadata is not None:
-            check_type(metadata, "metadata", Mapping, "pass a dictionary")
+            check.instance(metadata, "metadata", Mapping, "pass a dictionary")
         if not isinstance(params, FeatureParams):
             raise invalid("params", "be the FeatureParams of the pipeline's features", params)
         # The gains change the weights only, not the features.

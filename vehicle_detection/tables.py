@@ -13,12 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
     Floats,
-    check_array,
-    check_boxes,
-    check_integer,
-    check_number,
-    check_sequence,
-    check_type,
+    check,
     describe,
     invalid,
     is_listing,
@@ -131,7 +126,7 @@ class TrackTable:
         unknown = next((name for name in columns if name not in _COLUMNS), None)
         if unknown is not None:
             raise InvalidInputError(f"column must be one of {', '.join(_COLUMNS)}; got {unknown!r}")
-        frames, corners = check_keys(frame, "frame"), check_boxes(boxes).astype(np.float64)
+        frames, corners = check_keys(frame, "frame"), check.boxes(boxes).astype(np.float64)
         count = len(corners)
         if len(frames) != count:
             raise InvalidInputError(f"frame must be one key for each of the {count} boxes, got {len(frames)}")
@@ -185,7 +180,7 @@ class TrackTable:
         if not isinstance(detections, Mapping):
             raise InvalidInputError(f"detections must be a list or a dictionary, got {describe(detections)}")
         for key, found in detections.items():
-            check_type(found, f"detections[{key!r}]", Detections, "pass Detections(boxes, scores)")
+            check.instance(found, f"detections[{key!r}]", Detections, "pass Detections(boxes, scores)")
         parts = [Detections.empty(), *detections.values()]
         unknown = [np.full(len(found), np.nan) for found in parts]
         known = [gap if each.confidences is None else each.confidences for each, gap in zip(parts, unknown)]
@@ -251,7 +246,7 @@ class TrackTable:
         """
         if is_result(frame):
             frame, time, tracks = frame.index, getattr(frame, "time", None), frame.tracks
-        check_integer(frame, "frame", low=0)
+        check.integer(frame, "frame", low=0)
         if not self._growing:
             raise InvalidInputError("append needs a table that was empty at first; start with TrackTable()")
         first = int(self._keys[-1]) + 1 if self._keys else 0
@@ -261,7 +256,7 @@ class TrackTable:
                 "use a new TrackTable for another video"
             )
         if time is not None:
-            time = check_number(time, "time", low=-1e12, high=1e12)
+            time = check.number(time, "time", low=-1e12, high=1e12)
         shown = shown_tracks(tracks)
         self._reserve(self._size + len(shown))
         new = slice(self._size, self._size + len(shown))
@@ -338,7 +333,7 @@ class TrackTable:
 
     def rows(self, key: FrameKey) -> NDArray[np.intp]:
         """Row numbers of a frame's boxes; empty for a frame without boxes."""
-        check_type(key, "key", (int, str, np.integer), "pass the key of one frame")
+        check.instance(key, "key", (int, str, np.integer), "pass the key of one frame")
         if self._rows is None:
             found: dict[FrameKey, list[int]] = defaultdict(list)
             for row, of_row in enumerate(self["frame"].tolist()):
@@ -430,7 +425,7 @@ class TrackTable:
 
 def check_keys(values: object, name: str) -> tuple[FrameKey, ...]:
     """Return frame keys as Python values that are all int or all str."""
-    given = check_sequence(values, name, "frame keys (int or str)")
+    given = check.sequence(values, name, "frame keys (int or str)")
     keys = tuple(key.item() if isinstance(key, np.generic) else key for key in given)
     kinds = {type(key) for key in keys}
     if kinds - {int} and kinds - {str}:
@@ -453,7 +448,7 @@ def _check_column(values: ArrayLike | None, name: str, rows: int) -> NDArray[Any
         if len(labels) != rows or not all(isinstance(label, str) for label in labels):
             raise invalid("label", f"be a name for each of the {rows} boxes", values)
         return np.array(labels, object)
-    given = filled if values is None else check_array(values, name)
+    given = filled if values is None else check.array(values, name)
     if given.size == 0:
         given = given.reshape(-1).astype(filled.dtype)
     kinds = {"b": "b", "i": "iub", "f": "iufb"}[filled.dtype.kind]

@@ -9,15 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import (
-    check_array,
-    check_boxes,
-    check_image,
-    check_integer,
-    check_number,
-    check_type,
-    describe,
-)
+from vehicle_detection._common import check, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE, extract_features
@@ -54,16 +46,16 @@ def slide_window(
     >>> slide_window(np.zeros((64, 128, 3), np.uint8), xy_window=(64, 64)).tolist()
     [[0, 0, 64, 64], [32, 0, 96, 64], [64, 0, 128, 64]]
     """
-    height, width = check_image(image).shape[:2]
+    height, width = check.image(image).shape[:2]
     x1, x2 = _check_range(x_start_stop, width, "x_start_stop")
     y1, y2 = _check_range(y_start_stop, height, "y_start_stop")
     given = {"xy_window": xy_window, "xy_overlap": xy_overlap}
-    if any(np.shape(check_array(pair, name)) != (2,) for name, pair in given.items()):
+    if any(np.shape(check.array(pair, name)) != (2,) for name, pair in given.items()):
         raise InvalidInputError(f"xy_window and xy_overlap must be pairs; got {xy_window} and {xy_overlap}")
     steps = []
     for index, side in enumerate(xy_window):
-        check_integer(side, f"xy_window[{index}]", low=1)
-        overlap = check_number(xy_overlap[index], f"xy_overlap[{index}]", low=0, high=0.999)
+        check.integer(side, f"xy_window[{index}]", low=1)
+        overlap = check.number(xy_overlap[index], f"xy_overlap[{index}]", low=0, high=0.999)
         # The step is truncated as in the course; the small term compensates rounding, as in 50 * (1 - 0.9).
         steps.append(max(1, int(side * (1 - overlap) + 1e-9)))
     band = PixelBand(x1, y1, x2, y2, (int(xy_window[0]), int(xy_window[1])), (steps[0], steps[1]))
@@ -83,7 +75,7 @@ def _check_range(limits: Range, size: int, name: str) -> tuple[int, int]:
     """Replace None by the image's border and check that the range is inside."""
     pair: Any = limits
     numbers = (int, np.integer, type(None))
-    if np.shape(check_array(pair, name)) != (2,) or not all(isinstance(limit, numbers) for limit in pair):
+    if np.shape(check.array(pair, name)) != (2,) or not all(isinstance(limit, numbers) for limit in pair):
         raise InvalidInputError(f"{name} must be (start, stop), whole pixels or None; got {describe(limits)}")
     start = 0 if limits[0] is None else int(limits[0])
     stop = size if limits[1] is None else int(limits[1])
@@ -118,9 +110,9 @@ def search_windows(
     >>> len(search_windows(image, [[600, 400, 664, 464]], classifier, min_score=None))  # with its score
     1
     """
-    check_image(image)
-    check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
-    given = check_boxes(windows, "windows")
+    check.image(image)
+    check.instance(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+    given = check.boxes(windows, "windows")
     boxes = given.astype(np.int64)
     fractional = (boxes != given).any(1)
     if fractional.any():
@@ -128,7 +120,7 @@ def search_windows(
         raise InvalidInputError(
             f"windows must be whole pixels; got {given[row].tolist()} in row {row}; round them first"
         )
-    min_score = -np.inf if min_score is None else check_number(min_score, "min_score")
+    min_score = -np.inf if min_score is None else check.number(min_score, "min_score")
     height, width = image.shape[:2]
     inside = (boxes[:, :2] >= 0).all(1) & (boxes[:, 2] <= width) & (boxes[:, 3] <= height)
     valid = inside & (boxes[:, 2:] > boxes[:, :2]).all(1)
@@ -176,6 +168,6 @@ def find_cars(
     >>> len(find_cars(np.zeros((720, 1280, 3), np.uint8), load_classifier()))
     0
     """
-    check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+    check.instance(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
     with classifier.open_search(jobs) as search:
         return search.find_windows(image, SearchParams.preset() if params is None else params)

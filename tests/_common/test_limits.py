@@ -6,7 +6,7 @@ import zipfile
 
 import pytest
 
-from vehicle_detection._common import Limit, check_path, read_regular_file
+from vehicle_detection._common import Limit, check, read_regular_file
 from vehicle_detection.camera import read_camera
 from vehicle_detection.datasets import load_patches
 from vehicle_detection.detector import load_model
@@ -93,7 +93,7 @@ def test_impossible_file_names(name, read):
 
 def test_unusual_file_names_are_possible(tmp_path):
     for name in ("é" * 127, "name with\nline break", os.fsdecode(b"\xff\xfe")):
-        assert check_path(tmp_path / name) == tmp_path / name
+        assert check.path(tmp_path / name) == tmp_path / name
 
 
 @pytest.mark.parametrize(("read", "error", "variable"), READERS)

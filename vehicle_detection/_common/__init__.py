@@ -1,31 +1,15 @@
 """Helpers for all packages: argument checks, files, threads, progress bars, model files, augmentation."""
 
+from vehicle_detection._common import check
 from vehicle_detection._common.augment import blur_patches, degrade_patches, mirror_patches
-from vehicle_detection._common.checks import (
+from vehicle_detection._common.check import Floats, describe, invalid, is_listing, shorten
+from vehicle_detection._common.fields import (
     Checked,
-    Floats,
-    check_array,
-    check_bool,
-    check_boxes,
-    check_choice,
-    check_flags,
-    check_image,
-    check_integer,
-    check_number,
-    check_patches,
-    check_path,
-    check_sequence,
-    check_shape,
-    check_type,
     checked_field,
     choice,
-    describe,
     flag,
     integer,
-    invalid,
-    is_listing,
     number,
-    shorten,
     store_number,
 )
 from vehicle_detection._common.files import (
@@ -74,5 +58,10 @@ from vehicle_detection._common.web import (
     read_http,
     web_proxy,
 )
+
+check_array, check_bool, check_boxes, check_choice = check.array, check.boolean, check.boxes, check.choice
+check_flags, check_image, check_integer, check_number = check.flags, check.image, check.integer, check.number
+check_patches, check_path, check_sequence = check.patches, check.path, check.sequence
+check_shape, check_type = check.shape, check.instance
 
 check_environment()

@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from vehicle_detection._common.checks import check_path
+from vehicle_detection._common import check
 from vehicle_detection.errors import InvalidInputError, OutputError, VehicleDetectionError
 
 _LOGGER = logging.getLogger(__name__)
@@ -27,7 +27,7 @@ _SYSTEM_FOLDERS = ("__macosx", "$recycle.bin", "system volume information", "los
 
 def check_target(target: str | os.PathLike[str], name: str = "target") -> Path:
     """Return the path of a file to write, after checking that it is no device, and its folder is writable."""
-    path = check_path(target, name)
+    path = check.path(target, name)
     if path.is_dir():
         raise InvalidInputError(f"{name} must be a file, got the folder {path}; add a file name to it")
     if os.path.exists(path) and not path.is_file():  # it would be replaced by a file

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common.checks import check_path, invalid
+from vehicle_detection._common import check
 from vehicle_detection._common.files import atomic_write
 from vehicle_detection._common.limits import Limit, read_regular_file
 from vehicle_detection.errors import InvalidInputError, ModelFileError
@@ -86,7 +86,7 @@ def checksum(header: Mapping[str, str], tensors: Tensors) -> str:
 def read_model(path: str | os.PathLike[str], kind: str) -> ModelData:
     """Read and verify a model file, or a shipped model by its name."""
     if not isinstance(path, (str, os.PathLike)):
-        raise invalid("path", f"be a model file or one of {', '.join(map(repr, SHIPPED))}", path)
+        raise check.invalid("path", f"be a model file or one of {', '.join(map(repr, SHIPPED))}", path)
     if str(path) == "default":
         raise ModelFileError(
             "the shipped model 'default' is a network, no classifier of patches; load it with load_model"
@@ -96,7 +96,7 @@ def read_model(path: str | os.PathLike[str], kind: str) -> ModelData:
         if not resource.is_file():
             raise ModelFileError(f"the shipped model {path!r} is missing; install the package again")
         return _parse(resource.read_bytes(), f"the shipped model {path!r}", kind)
-    file = check_path(path)
+    file = check.path(path)
     name = f"model file {file}"
     if not os.path.lexists(file):
         raise ModelFileError(

@@ -7,7 +7,7 @@ import sys
 from types import SimpleNamespace
 from typing import Any
 
-from vehicle_detection._common.checks import check_flags
+from vehicle_detection._common import check
 
 _HIDDEN = SimpleNamespace(update=lambda n=1: None, set_description=lambda text: None)
 
@@ -32,7 +32,7 @@ def progress_bar(
     Nothing is shown if `show` is False or, with `interactive_only`, if standard error is neither a terminal
     nor the output of a notebook's cell.
     """
-    check_flags(progress=show)
+    check.flags(progress=show)
     # Not left to tqdm, whose import takes a tenth of a second.
     terminal = sys.stderr is not None and sys.stderr.isatty()  # None: closed
     if not show or (interactive_only and not terminal and not in_notebook()):

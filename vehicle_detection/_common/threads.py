@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common.checks import check_integer, invalid
+from vehicle_detection._common import check
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -101,13 +101,13 @@ def _read_cpu_quotas(root: Path) -> Iterator[float]:
 def resolve_jobs(jobs: int | None = None) -> int:
     """Return `jobs`, else the environment variable ``VEHICLE_DETECTION_JOBS``, else all cores."""
     if jobs is not None:
-        return check_integer(jobs, "jobs", low=1, high=_MAX_JOBS)
+        return check.integer(jobs, "jobs", low=1, high=_MAX_JOBS)
     text = os.environ.get(JOBS_VARIABLE, "")
     if not text:
         return available_cores()
     # The length first: Python refuses to convert thousands of digits.
     if not text.isdecimal() or len(text) > 9 or not 1 <= int(text) <= _MAX_JOBS:
-        raise invalid(JOBS_VARIABLE, f"be a number of threads from 1 to {_MAX_JOBS}", text)
+        raise check.invalid(JOBS_VARIABLE, f"be a number of threads from 1 to {_MAX_JOBS}", text)
     return int(text)
 
 

@@ -126,12 +126,12 @@ def detect(options: DetectOptions) -> None:
 
 def _expand(text: str) -> list[_Image]:
     """List the images of a folder, or of a pattern, which the shell of Windows passes on as it is."""
-    from vehicle_detection._common import check_path, is_url
+    from vehicle_detection._common import check, is_url
     from vehicle_detection.images import list_images
 
     if not text.strip():
         raise InvalidInputError("IMAGE must be a file, a folder or a URL, got an empty name")
-    path = check_path(text, "IMAGE", kind="an image file")
+    path = check.path(text, "IMAGE", kind="an image file")
     if is_url(text):
         return [_Image(text, path.name.partition("?")[0] or "image")]
     has_pattern = ("*" in text or "?" in text) and not path.exists()
@@ -143,12 +143,12 @@ def _expand(text: str) -> list[_Image]:
 
 def _check(options: DetectOptions, images: list[_Image]) -> None:
     """Refuse options and images that would fail, or be overwritten, after a part of the work is done."""
-    from vehicle_detection._common import check_choice, check_integer, check_suffix
+    from vehicle_detection._common import check, check_suffix
 
     output, boxes = options.output, options.boxes
-    check_choice(options.labels, "labels", ("score", "none"))
+    check.choice(options.labels, "labels", ("score", "none"))
     if options.line_width is not None:
-        check_integer(options.line_width, "line_width", low=1, high=1000)
+        check.integer(options.line_width, "line_width", low=1, high=1000)
     by_name: dict[str, _Image] = {}
     for image in images:
         other = by_name.setdefault(image.name, image)

@@ -120,7 +120,7 @@ def _parse_frames(text: str, keys: Sequence[FrameKey]) -> list[FrameKey]:
             chosen += range(int(first), int(last or first) + 1, int(step or 1))
     else:
         kind = "numbers such as 0,6,12 or 0-299 (0-299:6 for every 6th), or a file with a frame in each line"
-        file = common.check_path(text, "--frames", kind=kind)
+        file = common.check.path(text, "--frames", kind=kind)
         if not file.exists():
             raise InvalidInputError(f"--frames must be {kind}, got {text!r}")
         data = common.read_regular_file(file, f"--frames {text}", common.Limit.TEXT_BYTES)

@@ -134,4 +134,4 @@ def check_blur(region: str | None) -> None:
     from vehicle_detection.drawing import BLUR_REGIONS
 
     if region is not None:
-        common.check_choice(region, "--blur", BLUR_REGIONS)
+        common.check.choice(region, "--blur", BLUR_REGIONS)

@@ -270,7 +270,7 @@ def output_folder(folder: Path | None, option: str) -> Iterator[None]:
     if folder is None:
         yield
         return
-    common.check_path(folder, option, kind="a folder")
+    common.check.path(folder, option, kind="a folder")
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -65,9 +65,9 @@ def tune(
     cache: Path | None = option(None, "DIR", "Folder to keep features in, such as cache."),
 ) -> None:
     """Measure every combination of a grid of parameters, of training or of the search, and show the best."""
-    common.check_integer(finalists, "--finalists", low=1)
+    common.check.integer(finalists, "--finalists", low=1)
     values = vd.training.parse_grid(grid)
-    common.check_choice(split, "--split", ("sequences", "groups", "random"))
+    common.check.choice(split, "--split", ("sequences", "groups", "random"))
     sources = {"--vehicles": vehicles, "--non-vehicles": non_vehicles, "--labels": labels}
     given = {name: path for name, path in sources.items() if path is not None}
     targets = check_targets({"--output": output, "--plot": plot}, given)

@@ -386,7 +386,7 @@ class SideOutputs:
             refuse_if(options.clips is None, "--clips-of needs --clips, the folder of the clips; add it")
             self._clip_kinds = [kind.strip() for kind in options.clips_of.split(",")]
         for kind in self._clip_kinds:
-            common.check_choice(kind, "--clips-of", vd.drive.KINDS)
+            common.check.choice(kind, "--clips-of", vd.drive.KINDS)
 
     @contextlib.contextmanager
     def collect(

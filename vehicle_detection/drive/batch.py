@@ -20,10 +20,7 @@ import numpy as np
 
 from vehicle_detection._common import (
     available_cores,
-    check_choice,
-    check_flags,
-    check_integer,
-    check_type,
+    check,
     describe,
     hide_credentials,
     import_pyarrow,
@@ -203,17 +200,17 @@ def run_batch(
     >>> tracks = pandas.read_parquet("results/tracks")  # doctest: +SKIP
     """
     started = time.perf_counter()
-    check_choice(group, "group", ("trip", "file"))
+    check.choice(group, "group", ("trip", "file"))
     part = _parse_shard(shard)
-    check_flags(
+    check.flags(
         tracks_only=tracks_only, audio=audio, retry_failed=retry_failed, dry_run=dry_run, progress=progress
     )
     if executor is not None and not hasattr(executor, "submit"):
         raise invalid("executor", "be an executor of concurrent.futures", executor, "omit it")
     if on_record is not None and not callable(on_record):
         raise invalid("on_record", "be a function of a record", on_record)
-    workers = available_cores() if jobs is None else check_integer(jobs, "jobs", low=1, high=1024)
-    check_choice(preset, "preset", PRESETS)
+    workers = available_cores() if jobs is None else check.integer(jobs, "jobs", low=1, high=1024)
+    check.choice(preset, "preset", PRESETS)
     if executor is None and not dry_run:
         import_pyarrow()  # an error now, not after the first trip
     settings = _settings(model, options, tracks_only=tracks_only, audio=audio, preset=preset)
@@ -275,7 +272,7 @@ def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -
     name = os.fspath(model)
     if not shipped_model(name).is_file() and Path(name).exists():
         name = os.path.abspath(name)
-    check_type(options, "options", Mapping | None, "pass a dictionary")
+    check.instance(options, "options", Mapping | None, "pass a dictionary")
     given = dict(options or {})
     for key, value in given.items():  # a path or a number of NumPy
         if isinstance(value, (os.PathLike, np.generic)):

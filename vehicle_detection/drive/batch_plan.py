@@ -15,8 +15,7 @@ from typing import Any
 
 from vehicle_detection import __version__
 from vehicle_detection._common import (
-    check_path,
-    check_sequence,
+    check,
     hide_credentials,
     invalid,
     is_hidden,
@@ -41,13 +40,13 @@ def list_videos(sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str
     """Expand files, folders, patterns and URLs to absolute paths and URLs, sorted, each once."""
     found: dict[str, Facts] = {}
     single = isinstance(sources, (str, os.PathLike))
-    given = (sources,) if single else check_sequence(sources, "sources", "files, folders, patterns or URLs")
+    given = (sources,) if single else check.sequence(sources, "sources", "files, folders, patterns or URLs")
     for source in given:
         if not isinstance(source, (str, os.PathLike)) or not str(source).strip():
             raise invalid("sources", "be files, folders, patterns or URLs", source, "pass their names")
         text = local_path(os.fspath(source))
         if not is_url(text):
-            check_path(text, "sources", kind="a file, folder or pattern")
+            check.path(text, "sources", kind="a file, folder or pattern")
         files = dict(_list_remote(text) if is_url(text) else _list_local(Path(text)))
         if not files:
             raise InvalidInputError(f"sources {hide_credentials(text)} holds no videos; check the path")

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from vehicle_detection._common import (
     atomic_write,
-    check_path,
+    check,
     describe,
     encodable,
     hide_credentials,
@@ -66,7 +66,7 @@ def open_store(out: object, *, create: bool = False, exists: bool = True) -> Sto
         raise InvalidInputError(f"out must be a folder or a URL, got {describe(out)}; pass its path")
     if is_url(text):
         return Store(text.rstrip("/"))
-    folder = Path(os.path.abspath(check_path(text, "out", kind="a folder or a URL")))
+    folder = Path(os.path.abspath(check.path(text, "out", kind="a folder or a URL")))
     if create:
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,7 @@ import numpy as np
 
 from vehicle_detection import __version__
 from vehicle_detection._common import (
-    check_integer,
+    check,
     hide_credentials,
     import_pyarrow,
     is_url,
@@ -84,7 +84,7 @@ def open_detector(
 ) -> VehicleDetector:
     """Open the detector of a model and the options of a batch, of which `every` is that of the video."""
     if every is not None:
-        check_integer(every, "every", low=1, high=1000)
+        check.integer(every, "every", low=1, high=1000)
     return VehicleDetector(
         load_model(model, classes=classes, device=device),
         conf=conf,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from vehicle_detection._common import check_number, check_type, pluralize
+from vehicle_detection._common import check, pluralize
 from vehicle_detection.drive.events import Event, Kind, check_events
 from vehicle_detection.tables import TrackTable
 
@@ -75,8 +75,8 @@ def count_vehicles(events: Iterable[Event], table: TrackTable, *, fps: float) ->
     >>> print(counts.summary())
     overtook 0 vehicles, was overtaken by 0, met 1 oncoming; 0.0 vehicles in view on average, 0 at most
     """
-    rate = check_number(fps, "fps", above=0, high=1e6)
-    check_type(table, "table", TrackTable, "pass the tracks of the video")
+    rate = check.number(fps, "fps", above=0, high=1e6)
+    check.instance(table, "table", TrackTable, "pass the tracks of the video")
     listed = check_events(events)
     frames = table.counts()
     minutes = math.ceil(len(frames) / rate / 60 - 1e-9)

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from vehicle_detection._common import atomic_write, check_number, check_suffix, progress_bar
+from vehicle_detection._common import atomic_write, check, check_suffix, progress_bar
 from vehicle_detection.drive.events import EVENT_COLUMNS, Event, check_events
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video import cut_video, open_source
@@ -82,8 +82,8 @@ def cut_clips(
     >>> cut_clips([], "found.mp4", "clips", fps=25)
     []
     """
-    rate = check_number(fps, "fps", above=0, high=1e6)
-    margin = check_number(margin, "margin", low=0, high=3600)
+    rate = check.number(fps, "fps", above=0, high=1e6)
+    margin = check.number(margin, "margin", low=0, high=3600)
     listed = check_events(events)
     if not listed:
         return []

@@ -11,17 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import (
-    UNITS,
-    Floats,
-    Units,
-    check_array,
-    check_number,
-    check_sequence,
-    check_shape,
-    check_type,
-    describe,
-)
+from vehicle_detection._common import UNITS, Floats, Units, check, describe
 from vehicle_detection.camera import Camera
 from vehicle_detection.drive.history import TrackHistory, split_runs, track_histories
 from vehicle_detection.drive.motion import LANE_HALF_WIDTH_M, Bools, Motion, estimate_motion
@@ -170,9 +160,9 @@ EVENT_COLUMNS = tuple(field.name for field in fields(Event))
 
 def check_events(events: object) -> list[Event]:
     """Return `events` as a list, unless one is something else."""
-    listed = list(check_sequence(events, "events", "Event"))
+    listed = list(check.sequence(events, "events", "Event"))
     for event in listed:
-        check_type(event, "events", Event, "pass what find_events returned")
+        check.instance(event, "events", Event, "pass what find_events returned")
     return listed
 
 
@@ -216,15 +206,15 @@ def find_events(
     >>> [event.kind for event in find_events(table, fps=25, shape=(720, 1280, 3))]
     ['hard_closing', 'headway']
     """
-    rate = check_number(fps, "fps", above=0, high=1e6)
-    frame_shape = check_shape(shape)
+    rate = check.number(fps, "fps", above=0, high=1e6)
+    frame_shape = check.shape(shape)
     if camera is None:
         # Events use the focal length, which Camera.dashcam, the tracker's default, has too, but neither the
         # horizon nor the errors of the lens, in which the two differ.
         camera = Camera.for_frame(frame_shape)
-    check_type(camera, "camera", Camera, "omit it for a typical dash-cam")
+    check.instance(camera, "camera", Camera, "omit it for a typical dash-cam")
     camera = camera.for_shape(frame_shape)
-    check_type(table, "table", TrackTable, "append the results of process_video to one")
+    check.instance(table, "table", TrackTable, "append the results of process_video to one")
     histories = track_histories(table)
     length = max((track.last + 1 for track in histories), default=0)
     own_speed = _check_speed(own_speed_mps, length)
@@ -259,7 +249,7 @@ def _check_speed(speed: float | ArrayLike | None, length: int) -> Floats:
     """Own speed in each frame, NaN where it is unknown."""
     if speed is None:
         return np.full(length, np.nan)
-    array = check_array(speed, "own_speed_mps")
+    array = check.array(speed, "own_speed_mps")
     shaped = array.ndim == 0 or (array.ndim == 1 and len(array) >= length)
     if not shaped or array.dtype.kind not in "iuf" or np.isinf(array).any() or (array < 0).any():
         raise InvalidInputError(

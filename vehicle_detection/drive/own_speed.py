@@ -22,9 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import (
     Floats,
     Limit,
-    check_array,
-    check_number,
-    check_path,
+    check,
     invalid,
     pluralize,
     read_regular_file,
@@ -74,7 +72,7 @@ class OwnSpeed:
     def __post_init__(self) -> None:
         for name in ("seconds", "speeds_mps"):
             given = getattr(self, name)
-            values = check_array(given, name)
+            values = check.array(given, name)
             if values.ndim != 1 or not len(values) or values.dtype.kind not in "iuf":
                 raise invalid(name, "be a list of numbers", given, "pass at least one")
             if not np.isfinite(values).all():
@@ -92,7 +90,7 @@ class OwnSpeed:
                 f"speeds_mps must be at least 0, got {self.speeds_mps.min():g}; pass speeds, not velocities"
             )
         store_number(self, "max_gap", above=0)
-        clock = check_array(self.clock, "clock")
+        clock = check.array(self.clock, "clock")
         pairs = clock.ndim == 2 and clock.shape[1] == 2 and clock.dtype.kind in "iuf"
         if clock.size and not (pairs and np.isfinite(clock).all()):
             raise invalid("clock", "be pairs of seconds", self.clock, "pass what segment_clock returns")
@@ -100,12 +98,12 @@ class OwnSpeed:
     @classmethod
     def constant(cls, speed_mps: float) -> OwnSpeed:
         """Return a speed that does not change."""
-        speed = check_number(speed_mps, "speed_mps", low=0, high=_MAX_SPEED)
+        speed = check.number(speed_mps, "speed_mps", low=0, high=_MAX_SPEED)
         return cls(np.array([-1e12, 1e12]), np.array([speed, speed]), max_gap=1e13)
 
     def at(self, seconds: ArrayLike) -> Floats:
         """Speed in m/s at each time: interpolated; NaN before, after and in long gaps of the record."""
-        given = check_array(seconds, "seconds")
+        given = check.array(seconds, "seconds")
         if given.dtype.kind not in "iuf":
             raise invalid("seconds", "be numbers", seconds, "pass times in seconds")
         times: Floats = given.astype(np.float64)
@@ -156,9 +154,9 @@ def read_own_speed(path: str | os.PathLike[str], *, offset: float = 0.0) -> OwnS
     >>> read_own_speed(file).at([0.5])
     array([25.5])
     """
-    check_path(path, "path")
+    check.path(path, "path")
     file = Path(path)
-    shift = check_number(offset, "offset", low=-1e9, high=1e9)
+    shift = check.number(offset, "offset", low=-1e9, high=1e9)
     readers = {".gpx": _read_gpx, ".nmea": _read_nmea, ".csv": _read_csv}
     reader = readers.get(file.suffix.lower())
     if reader is None:
@@ -377,10 +375,10 @@ def _read_nmea(data: bytes, name: str) -> Floats:
     """Read the points of valid RMC sentences, with times since 1970."""
     rows = []
     for found in _RMC.finditer(data.decode("ascii", "replace")):
-        _, hour, minute, second, lat, lat_minutes, south, lon, lon_minutes, west, knots, *date, check = (
+        _, hour, minute, second, lat, lat_minutes, south, lon, lon_minutes, west, knots, *date, given = (
             found.groups()
         )
-        if functools.reduce(lambda bits, letter: bits ^ ord(letter), found["text"], 0) == int(check, 16):
+        if functools.reduce(lambda bits, letter: bits ^ ord(letter), found["text"], 0) == int(given, 16):
             day, month, year = date
             time = _parse_time(f"20{year}-{month}-{day}T{hour}:{minute}:{second[:2]}")
             north = (int(lat) + float(lat_minutes) / 60) * (-1 if south == "S" else 1)

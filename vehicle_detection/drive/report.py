@@ -26,12 +26,8 @@ from vehicle_detection._common import (
     Floats,
     Units,
     atomic_write,
-    check_choice,
-    check_integer,
-    check_path,
-    check_sequence,
+    check,
     check_suffix,
-    check_type,
     format_with_error,
     hide_credentials,
     is_url,
@@ -144,20 +140,20 @@ class ReportWriter:
         embed_limit: int = 60_000_000,
         units: Literal["metric", "imperial"] = "metric",
     ) -> None:
-        check_choice(units, "units", UNITS)
+        check.choice(units, "units", UNITS)
         self._path = check_suffix(path, "path", (".html", ".htm"))
         for name, value in (("video", video), ("source", source)):
             if value is None:
                 continue
             if not (name == "source" and isinstance(value, str) and is_url(value)):
-                check_path(value, name)  # a URL may have longer parts
+                check.path(value, name)  # a URL may have longer parts
             if os.path.realpath(value) == os.path.realpath(self._path):
                 raise InvalidInputError(f"path {self._path} is also the {name}; choose another name")
         self._video = None if video is None else Path(video)
         self._source = None if source is None else Path(hide_credentials(os.fspath(source))).name
         self._source_path = None if source is None else str(Path(source))
         self._detector, self._units = detector, units
-        self._embed_limit = check_integer(embed_limit, "embed_limit", low=0)
+        self._embed_limit = check.integer(embed_limit, "embed_limit", low=0)
         self.table = TrackTable()  # of the frames that were added
 
     def __call__(self, result: Any) -> None:
@@ -180,7 +176,7 @@ class ReportWriter:
         pictures
             `TrackPicture` objects to list below the tracks.
         """
-        check_type(report, "report", VideoReport, "pass what process_video returned")
+        check.instance(report, "report", VideoReport, "pass what process_video returned")
         fps = float(report.fps)
         own = getattr(getattr(self._detector, "annotator", None), "own_speed", None)
         speeds = None if own is None else own_speeds(own, self.table, fps=fps)
@@ -188,9 +184,9 @@ class ReportWriter:
             camera = getattr(self._detector, "camera", None)
             camera = camera.for_shape(report.shape) if isinstance(camera, Camera) else None
             events = find_events(self.table, fps=fps, shape=report.shape, camera=camera, own_speed_mps=speeds)
-        listed = check_sequence(pictures, "pictures", "TrackPicture")
+        listed = check.sequence(pictures, "pictures", "TrackPicture")
         for picture in listed:
-            check_type(picture, "pictures", TrackPicture, "omit them, or pass TrackPicture objects")
+            check.instance(picture, "pictures", TrackPicture, "omit them, or pass TrackPicture objects")
         if self._source_path and self._source:  # without its folder, as in the title
             damage = report.damage.replace(self._source_path, self._source)
             report = dataclasses.replace(report, damage=damage)

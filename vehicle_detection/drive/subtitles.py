@@ -11,17 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from vehicle_detection._common import (
-    UNITS,
-    Floats,
-    Units,
-    check_choice,
-    check_number,
-    check_suffix,
-    check_type,
-    pluralize,
-    write_text,
-)
+from vehicle_detection._common import UNITS, Floats, Units, check, check_suffix, pluralize, write_text
 from vehicle_detection.annotator import MAX_SPEED_STD
 from vehicle_detection.drive.events import Event, check_events
 from vehicle_detection.drive.history import TrackHistory, track_histories
@@ -105,11 +95,11 @@ def write_subtitles(
     own speed 90 km/h
     no vehicle
     """
-    check_type(table, "table", TrackTable, "append the results of process_video to one")
+    check.instance(table, "table", TrackTable, "append the results of process_video to one")
     target = check_suffix(path, "path", SUBTITLE_SUFFIXES)
-    rate = check_number(fps, "fps", above=0, high=1e6)
-    check_type(own_speed, "own_speed", OwnSpeed | None, "pass what read_own_speed returns")
-    check_choice(units, "units", UNITS)
+    rate = check.number(fps, "fps", above=0, high=1e6)
+    check.instance(own_speed, "own_speed", OwnSpeed | None, "pass what read_own_speed returns")
+    check.choice(units, "units", UNITS)
     listed = check_events(events)
     cues = list(_merge(_second_texts(table, rate, listed, own_speed, UNITS[units])))
     end = len(table.counts()) / rate

@@ -21,7 +21,7 @@ from datetime import datetime, timedelta
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
-from vehicle_detection._common import available_cores, check_sequence, check_type, describe, is_url, pluralize
+from vehicle_detection._common import available_cores, check, describe, is_url, pluralize
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.video import FrameSource, Source, is_video_file, list_files, open_source, probe_video
 
@@ -129,7 +129,7 @@ def find_trips(files: Iterable[File], *, duration: Callable[[File], float] | Non
     rear 2026-01-31 08:15:00 1
     """
     groups: defaultdict[tuple[str, str, str, bool], list[tuple[_Segment, File]]] = defaultdict(list)
-    for file in check_sequence(files, "files", "paths"):
+    for file in check.sequence(files, "files", "paths"):
         if not isinstance(file, (str, Path)):
             raise InvalidInputError(f"files must be paths or URLs, got {describe(file)}; pass strings")
         name = _posix(file)
@@ -232,7 +232,7 @@ def segment_clock(source: FrameSource) -> tuple[tuple[float, float], ...]:
     Such as after pauses between segments; steps of up to a second are those of the names. Empty without times
     in the names.
     """
-    check_type(source, "source", FrameSource, "pass what open_trip returns")
+    check.instance(source, "source", FrameSource, "pass what open_trip returns")
     starts = [_parse_name(_posix(file)).start for file in source.files]
     clock, offset = list[tuple[float, float]](), 0.0
     for begin, start in zip(source.segment_starts, starts):

@@ -18,16 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._common import (
-    Limit,
-    check_choice,
-    check_path,
-    check_regular_file,
-    check_sequence,
-    describe,
-    import_pyarrow,
-    shorten,
-)
+from vehicle_detection._common import Limit, check, check_regular_file, describe, import_pyarrow, shorten
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import DatasetError
@@ -385,12 +376,12 @@ def read_labels(
     ...
     vehicle_detection.errors.DatasetError: labels/missing.csv does not exist; check the path
     """
-    source = check_path(path, "path", kind="a file or folder")
+    source = check.path(path, "path", kind="a file or folder")
     pictures = None
     if images is not None:
-        pictures = load_frames(check_path(images, "images", kind="the folder of the images"))
+        pictures = load_frames(check.path(images, "images", kind="the folder of the images"))
     if format is not None:
-        check_choice(format, "format", _READ_FORMATS)
+        check.choice(format, "format", _READ_FORMATS)
     if not source.exists():
         raise DatasetError(f"{source} does not exist; check the path")
     kind = format or _guess_format(source)
@@ -400,10 +391,10 @@ def read_labels(
         )
     chosen = None
     if classes is not None:
-        chosen = frozenset(str(name).lower() for name in check_sequence(classes, "classes", "names"))
+        chosen = frozenset(str(name).lower() for name in check.sequence(classes, "classes", "names"))
     if kind in ("coco", "coco_results"):  # told apart by their content
         found = rows_of_records(
-            *read_coco(source, chosen, None if truth is None else check_path(truth, "truth"))
+            *read_coco(source, chosen, None if truth is None else check.path(truth, "truth"))
         )
     elif kind == "yolo":
         found, shape = read_yolo(source, chosen, shape, pictures), None  # its boxes are clipped

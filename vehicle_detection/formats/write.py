@@ -18,10 +18,8 @@ import numpy as np
 
 from vehicle_detection._common import (
     atomic_write,
-    check_choice,
-    check_number,
+    check,
     check_target,
-    check_type,
     describe,
     invalid,
     is_listing,
@@ -304,7 +302,7 @@ def _check_format(path: object, name: str | None, allowed: Iterable[str]) -> str
             f"path must end in {', '.join(suffixes)}, got {Path(path).name!r}; "
             f"or set the format to {', '.join(map(repr, choices))}"
         )
-    check_choice(kind, "format", choices)
+    check.choice(kind, "format", choices)
     if kind not in FOLDER_FORMATS:
         check_target(path, "path")
     return str(kind)
@@ -360,7 +358,7 @@ def open_tracks(
     frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps,confidence,distance_std_m,speed_std_mps,label
     """
     kind = _check_format(path, format, _TRACK_FORMATS)
-    rate = None if fps is None else check_number(fps, "fps", above=0, high=1e6)
+    rate = None if fps is None else check.number(fps, "fps", above=0, high=1e6)
     columns = TRACK_COLUMNS if rate is None else (*TRACK_COLUMNS, TIME_COLUMN)
     with _open_target(kind, _Target(Path(path), columns, shape, rounded=True)) as write:
         yield TrackStream(write, rate)
@@ -427,7 +425,7 @@ def write_tracks(
     for record in records if named else ():
         record["track_id"] = None if record["track_id"] == NO_TRACK else record["track_id"]
     if fps is not None:
-        rate = check_number(fps, "fps", above=0, high=1e6)
+        rate = check.number(fps, "fps", above=0, high=1e6)
         columns = (*columns, TIME_COLUMN)
         records = [_round({**record, TIME_COLUMN: record["frame"] / rate}) for record in records]
     with _open_target(kind, _Target(Path(path), columns, shape, named, rounded=True)) as write:
@@ -483,7 +481,7 @@ def write_labels(
     >>> read_labels(file)["frame"]
     array([0, 2])
     """
-    check_type(labels, "labels", TrackTable, "collect the boxes of each frame in one")
+    check.instance(labels, "labels", TrackTable, "collect the boxes of each frame in one")
     kind = _check_format(path, format, _WRITERS)
     if truth is not None and not kind.startswith("coco"):
         raise InvalidInputError(f"truth must be None for the format {kind!r}; only COCO files have image ids")

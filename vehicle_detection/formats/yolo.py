@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._common import Limit, check_shape, describe, read_regular_file
+from vehicle_detection._common import Limit, check, describe, read_regular_file
 from vehicle_detection.boxes import clip_boxes, logit
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import DatasetError, InvalidInputError
@@ -87,7 +87,7 @@ def read_yolo(source: Path, classes: Collection[str] | None, shape: Any, images:
 
 def _yolo_frames(files: Sequence[Path], shape: Any) -> list[tuple[FrameKey, tuple[int, ...]]]:
     """Frame and shape of each file, all of one shape: numbers if all names have six digits."""
-    shape = check_shape(shape)
+    shape = check.shape(shape)
     numbered = all(file.stem.isdecimal() and file.stem == f"{int(file.stem):06d}" for file in files)
     return [(int(file.stem) if numbered else file.stem, shape) for file in files]
 

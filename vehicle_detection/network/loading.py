@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Limit, check_path, check_sequence, invalid, read_regular_file
+from vehicle_detection._common import Limit, check, invalid, read_regular_file
 from vehicle_detection.boxes import logit
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.network.model import INPUT_SIZE, NetworkModel, NetworkParams
@@ -78,7 +78,7 @@ def _read(path: str | os.PathLike[str]) -> tuple[bytes, str]:
         if not (resource / f"{path}.onnx").is_file():
             raise ModelFileError(f"{name} is missing; install the package again")
         return (resource / f"{path}.onnx").read_bytes(), name
-    file = check_path(path)
+    file = check.path(path)
     name = f"model file {file}"
     data = read_regular_file(file, name, Limit.NETWORK_BYTES, error=ModelFileError)
     if data[:2] == b"PK" or data[:1] == b"\x80":
@@ -229,7 +229,7 @@ def _class_ids(
         return np.array(sorted(ids), np.intp) if known else None
     ids = []
     count = model.output_format.n_classes or 1 << 31
-    for each in check_sequence(classes, "classes", "names or numbers of classes"):
+    for each in check.sequence(classes, "classes", "names or numbers of classes"):
         number = numbers.get(each.lower(), -1) if isinstance(each, str) else each
         is_number = isinstance(number, (int, np.integer)) and not isinstance(number, bool)
         if not is_number or not 0 <= number < count or (known and number not in known):

@@ -17,7 +17,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_choice, resolve_jobs, shorten
+from vehicle_detection._common import check, resolve_jobs, shorten
 from vehicle_detection.errors import DetectorError, InvalidInputError, ModelFileError
 
 Array = NDArray[Any]
@@ -82,8 +82,8 @@ def read_facts(graph: bytes, name: str) -> GraphFacts:
 
 def check_device(device: Device, runtime: Runtime) -> None:
     """Raise unless the device and the library are known and available."""
-    check_choice(device, "device", ("cpu", "cuda"))
-    check_choice(runtime, "runtime", ("auto", "onnxruntime", "openvino"))
+    check.choice(device, "device", ("cpu", "cuda"))
+    check.choice(runtime, "runtime", ("auto", "onnxruntime", "openvino"))
     if runtime == "openvino" and importlib.util.find_spec("openvino") is None:
         raise InvalidInputError(
             "runtime 'openvino' needs the package openvino, which is not installed; run "

@@ -8,16 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import (
-    Checked,
-    check_integer,
-    check_number,
-    checked_field,
-    choice,
-    describe,
-    integer,
-    number,
-)
+from vehicle_detection._common import Checked, check, checked_field, choice, describe, integer, number
 from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes.raster import Color, Doubles, Floats, Image, Rng, tile_to, wrapped_noise
@@ -144,7 +135,7 @@ def _check_shape(shape: object, name: str) -> tuple[int, int]:
     if not isinstance(shape, tuple) or len(shape) != 2:
         raise InvalidInputError(f"{name} must be (height, width) in pixels, got {describe(shape)}")
     height, width = (
-        check_integer(size, f"{name}[{axis}]", low=64, high=4320) for axis, size in enumerate(shape)
+        check.integer(size, f"{name}[{axis}]", low=64, high=4320) for axis, size in enumerate(shape)
     )
     return height, width
 
@@ -166,7 +157,7 @@ class SceneView(Checked):
         height, width = self.shape
         focal_px = 0.9 * max(self.shape)
         if self.focal_px is not None:
-            focal_px = check_number(self.focal_px, "focal_px", low=0.2 * width, high=10.0 * width)
+            focal_px = check.number(self.focal_px, "focal_px", low=0.2 * width, high=10.0 * width)
         camera = Camera(
             focal_px=focal_px, horizon_px=self.horizon * height, height_m=self.camera_height_m,
             focal_std=0.0, height_std_m=0.0, shape=self.shape,

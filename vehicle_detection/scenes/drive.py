@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._common import atomic_write, check_bool, check_choice, check_integer, check_number
+from vehicle_detection._common import atomic_write, check
 from vehicle_detection.scenes.bodywork import VehicleBody
 from vehicle_detection.scenes.camera_light import SceneConfig, SceneView
 from vehicle_detection.scenes.raster import Rng
@@ -212,7 +212,7 @@ class Drive:
         return self._renderer.scene(*self._state(frame), frame)
 
     def _check_index(self, index: int) -> int:
-        return check_integer(index, "frame number", low=-self._frames, high=self._frames - 1) % self._frames
+        return check.integer(index, "frame number", low=-self._frames, high=self._frames - 1) % self._frames
 
     def __iter__(self) -> Iterator[Scene]:
         """Render one frame after the other."""
@@ -292,10 +292,10 @@ def render_drive(
     (50, (180, 320, 3))
     """
     rng = make_generator(random_state)
-    frames = check_integer(frames, "frames", low=1)
-    fps = check_number(fps, "fps", low=1.0, high=1000.0)
-    check_choice(scenario, "scenario", SCENARIOS)
-    rough = check_bool(rough, "rough")
+    frames = check.integer(frames, "frames", low=1)
+    fps = check.number(fps, "fps", low=1.0, high=1000.0)
+    check.choice(scenario, "scenario", SCENARIOS)
+    rough = check.boolean(rough, "rough")
     config = SceneView(**view).configure(rng)
     road, traffic = make_traffic(scenario, frames / fps, rng)
     if rough:

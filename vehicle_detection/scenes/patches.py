@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer
+from vehicle_detection._common import check
 from vehicle_detection.camera import Camera
 from vehicle_detection.scenes.bodywork import VehicleBody
 from vehicle_detection.scenes.camera_light import SceneConfig, Sensor, make_light
@@ -48,8 +48,8 @@ def render_patches(
     >>> patches.shape, labels.tolist()
     ((6, 64, 64, 3), [True, True, True, False, False, False])
     """
-    n = check_integer(n, "n", low=1)
-    size = check_integer(size, "size", low=16, high=512)
+    n = check.integer(n, "n", low=1)
+    size = check.integer(size, "size", low=16, high=512)
     rng = make_generator(random_state)
     patches = np.empty((n, size, size, 3), np.uint8)
     n_vehicles = (n + 1) // 2

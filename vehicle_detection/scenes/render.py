@@ -140,11 +140,9 @@ def ground_truth(
     visible = instance_map[sprite.region][sprite.solid] == pose.track
     fraction = 1 - np.count_nonzero(visible) / visible.size
     occluded = 2 if fraction > 0.5 else 1 if fraction >= 0.1 else 0
-    left, top, right, bottom = map(int, box)
-    truth = VehicleTruth(
-        pose.track, (left, top, right, bottom), (x1, y1, x2, y2), pose.start, pose.speed, fraction, occluded,
-        truncated, ignore=int(pose.oncoming),
-    )  # fmt: skip
+    corners: Any = tuple(map(int, box))
+    facts = pose.track, corners, (x1, y1, x2, y2), pose.start, pose.speed, fraction, occluded, truncated
+    truth = VehicleTruth(*facts, ignore=int(pose.oncoming))
     return replace(truth, ignore=1) if truth.hard_to_see else truth
 
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Checked, check_integer, check_sequence, check_type, choice, number
+from vehicle_detection._common import Checked, check, choice, number
 from vehicle_detection.camera import Camera
 from vehicle_detection.scenes.bodywork import VehicleBody
 from vehicle_detection.scenes.camera_light import SceneConfig, SceneView, Sensor
@@ -54,7 +54,7 @@ def make_generator(random_state: RandomState) -> np.random.Generator:
     """Check `random_state` and turn it into a generator."""
     if random_state is None or isinstance(random_state, np.random.Generator):
         return np.random.default_rng(random_state)
-    return np.random.default_rng(check_integer(random_state, "random_state", low=0))
+    return np.random.default_rng(check.integer(random_state, "random_state", low=0))
 
 
 class SceneRenderer:
@@ -141,15 +141,15 @@ def render_scene(
     rng = make_generator(random_state)
     config = SceneView(**view).configure(rng)
     own = int(rng.integers(3))
-    road = Road(own=own if lane is None else check_integer(lane, "lane", low=0, high=2))
+    road = Road(own=own if lane is None else check.integer(lane, "lane", low=0, high=2))
     if vehicles is None:
         vehicles = int(rng.integers(1, 6))
     if isinstance(vehicles, (int, np.integer)):
-        vehicles = _random_vehicles(road, check_integer(vehicles, "vehicles", low=0, high=60), rng)
+        vehicles = _random_vehicles(road, check.integer(vehicles, "vehicles", low=0, high=60), rng)
     poses = []
-    for track, vehicle in enumerate(check_sequence(vehicles, "vehicles", "SceneVehicle"), start=1):
+    for track, vehicle in enumerate(check.sequence(vehicles, "vehicles", "SceneVehicle"), start=1):
         remedy = "make one with SceneVehicle(distance_m=20)"
-        check_type(vehicle, f"vehicles[{track - 1}]", SceneVehicle, remedy)
+        check.instance(vehicle, f"vehicles[{track - 1}]", SceneVehicle, remedy)
         # A generator for each vehicle: adding or removing a vehicle does not change the appearance of others.
         look = random_appearance(np.random.default_rng([config.seed, 5, track]))
         look |= {"kind": vehicle.kind or look["kind"], "color": vehicle.color or look["color"]}

@@ -1,24 +1,16 @@
-"""Argument checks: each message names the argument, the expectation, the value and the remedy.
+"""Checks of arguments: each error names the argument, the expectation, the value and the remedy.
 
-The fields of a parameter class declare what they accept, and `Checked` checks them all.
-
->>> @dataclass(frozen=True, kw_only=True)
-... class Params(Checked):
-...     size: int | None = integer(None, low=1)
-...     overlap: float = number(0.5, low=0, high=1)
->>> Params(overlap=2)
+>>> integer(0, "jobs", low=1)
 Traceback (most recent call last):
-vehicle_detection.errors.InvalidInputError: overlap must be a number, at least 0 and at most 1; got 2
+vehicle_detection.errors.InvalidInputError: jobs must be an integer at least 1; got 0
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import os
-from collections.abc import Callable, Collection, Iterable
-from dataclasses import MISSING, dataclass
+from collections.abc import Collection, Iterable
 from numbers import Real
 from pathlib import Path
 from typing import Any, TypeGuard, get_args
@@ -59,7 +51,7 @@ def invalid(name: str, must: str, got: object, remedy: str = "") -> InvalidInput
     return InvalidInputError(f"{name} must {must}, got {describe(got)}{'; ' * bool(remedy)}{remedy}")
 
 
-def check_type(value: object, name: str, kind: Any, remedy: str) -> None:
+def instance(value: object, name: str, kind: Any, remedy: str) -> None:
     """Raise unless `value` is an instance of `kind`: a class, a union such as ``Camera | None``, a tuple."""
     if not isinstance(value, kind):
         kinds = kind if isinstance(kind, tuple) else get_args(kind) or (kind,)
@@ -68,17 +60,17 @@ def check_type(value: object, name: str, kind: Any, remedy: str) -> None:
         raise InvalidInputError(f"{name} must be {article} {names}, got {describe(value)}; {remedy}")
 
 
-def check_path(path: object, name: str = "path", *, kind: str = "a file name") -> Path:
+def path(value: object, name: str = "path", *, kind: str = "a file name") -> Path:
     """Return a path, unless no file can have that name."""
-    if not isinstance(path, (str, os.PathLike)):
-        raise invalid(name, f"be {kind}", path, "pass a path")
-    text = os.fspath(path)
+    if not isinstance(value, (str, os.PathLike)):
+        raise invalid(name, f"be {kind}", value, "pass a path")
+    text = os.fspath(value)
     if not isinstance(text, str):
-        raise invalid(name, f"be {kind} as text", path, "use os.fsdecode")
+        raise invalid(name, f"be {kind} as text", value, "use os.fsdecode")
     try:
         too_long = len(os.fsencode(text)) > _MAX_PATH
     except UnicodeEncodeError:
-        raise invalid(name, f"be {kind}", path, "drop the character that files cannot have") from None
+        raise invalid(name, f"be {kind}", value, "drop the character that files cannot have") from None
     too_long |= any(len(os.fsencode(part)) > _MAX_NAME for part in Path(text).parts)
     if too_long or "\0" in text:
         problem = f"more than {_MAX_NAME} bytes" if too_long else "a null character"
@@ -86,36 +78,36 @@ def check_path(path: object, name: str = "path", *, kind: str = "a file name") -
     return Path(text)
 
 
-def check_image(image: object, name: str = "image") -> NDArray[np.uint8]:
-    """Return `image` if it is ``(H, W, 3)`` uint8; the error says how to convert other arrays."""
-    if not isinstance(image, np.ndarray):
+def image(value: object, name: str = "image") -> NDArray[np.uint8]:
+    """Return `value` if it is ``(H, W, 3)`` uint8; the error says how to convert other arrays."""
+    if not isinstance(value, np.ndarray):
         remedy = "read files with vehicle_detection.read_image"
-        if hasattr(image, "convert"):
+        if hasattr(value, "convert"):
             remedy = "convert it with numpy.asarray(image.convert('RGB'))"
-        elif hasattr(image, "__array__"):
+        elif hasattr(value, "__array__"):
             remedy = "convert it with numpy.asarray(image)"
-        elif isinstance(image, (list, tuple)):
+        elif isinstance(value, (list, tuple)):
             remedy = "pass one image after the other"
-        elif isinstance(image, bytes):
+        elif isinstance(value, bytes):
             remedy = "decode it with vehicle_detection.read_image(data)"
-        raise invalid(name, "be an (H, W, 3) uint8 RGB array", image, remedy)
-    if image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 1):
+        raise invalid(name, "be an (H, W, 3) uint8 RGB array", value, remedy)
+    if value.ndim == 2 or (value.ndim == 3 and value.shape[2] == 1):
         remedy = "convert a grayscale image with cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)"
-    elif image.ndim == 3 and image.shape[2] == 4:
+    elif value.ndim == 3 and value.shape[2] == 4:
         remedy = "drop the alpha channel with image[..., :3]"
-    elif image.ndim == 4:
+    elif value.ndim == 4:
         remedy = "pass one image after the other"
-    elif image.ndim == 3 and image.shape[2] != 3 and image.shape[0] == 3:
+    elif value.ndim == 3 and value.shape[2] != 3 and value.shape[0] == 3:
         remedy = "put the channels last with image.transpose(1, 2, 0)"
-    elif image.ndim != 3 or image.shape[2] != 3:
+    elif value.ndim != 3 or value.shape[2] != 3:
         remedy = "pass one image with three color channels"
-    elif image.shape[0] == 0 or image.shape[1] == 0:
+    elif value.shape[0] == 0 or value.shape[1] == 0:
         remedy = "the image is empty"
-    elif image.dtype != np.uint8:
-        remedy = _conversion_to_uint8(image, "image")
+    elif value.dtype != np.uint8:
+        remedy = _conversion_to_uint8(value, "image")
     else:
-        return image
-    raise InvalidInputError(f"{name} must be an (H, W, 3) uint8 RGB array, got {describe(image)}; {remedy}")
+        return value
+    raise invalid(name, "be an (H, W, 3) uint8 RGB array", value, remedy)
 
 
 def _conversion_to_uint8(values: NDArray[Any], name: str) -> str:
@@ -131,34 +123,34 @@ def _conversion_to_uint8(values: NDArray[Any], name: str) -> str:
     return f"convert it with {name}.astype(numpy.uint8) once its values lie in 0-255"
 
 
-def check_patches(patches: object, size: int, name: str = "patches") -> NDArray[np.uint8]:
-    """Return `patches` as an ``(N, size, size, 3)`` uint8 array; a list of such images is stacked."""
-    patches = getattr(patches, "patches", patches)  # of a PatchSet
-    if isinstance(patches, (list, tuple)):
-        images = [check_image(patch, f"{name}[{index}]") for index, patch in enumerate(patches)]
-        for index, image in enumerate(images):
-            if image.shape != (size, size, 3):
+def patches(values: object, size: int, name: str = "patches") -> NDArray[np.uint8]:
+    """Return `values` as an ``(N, size, size, 3)`` uint8 array; a list of such images is stacked."""
+    values = getattr(values, "patches", values)  # of a PatchSet
+    if isinstance(values, (list, tuple)):
+        images = [image(patch, f"{name}[{index}]") for index, patch in enumerate(values)]
+        for index, each in enumerate(images):
+            if each.shape != (size, size, 3):
                 raise InvalidInputError(
-                    f"{name}[{index}] must be {size}x{size} pixels, got {image.shape[1]}x{image.shape[0]}; "
+                    f"{name}[{index}] must be {size}x{size} pixels, got {each.shape[1]}x{each.shape[0]}; "
                     f"resize it with cv2.resize(image, ({size}, {size}))"
                 )
         return np.stack(images) if images else np.empty((0, size, size, 3), np.uint8)
     remedy = "read a folder or zip with vehicle_detection.load_patches"
-    if isinstance(patches, np.ndarray):
-        if patches.ndim == 4 and patches.shape[1:] == (size, size, 3):
-            if patches.dtype == np.uint8:
-                return patches
-            remedy = _conversion_to_uint8(patches, name)
-        elif patches.shape == (size, size, 3):
+    if isinstance(values, np.ndarray):
+        if values.ndim == 4 and values.shape[1:] == (size, size, 3):
+            if values.dtype == np.uint8:
+                return values
+            remedy = _conversion_to_uint8(values, name)
+        elif values.shape == (size, size, 3):
             remedy = f"pass a single patch as {name}[None]"
-        elif patches.ndim in (3, 4):
+        elif values.ndim in (3, 4):
             remedy = f"resize each image with cv2.resize(image, ({size}, {size}))"
     raise invalid(
-        name, f"be an (N, {size}, {size}, 3) uint8 RGB array or a list of such images", patches, remedy
+        name, f"be an (N, {size}, {size}, 3) uint8 RGB array or a list of such images", values, remedy
     )
 
 
-def check_array(values: object, name: str) -> NDArray[Any]:
+def array(values: object, name: str) -> NDArray[Any]:
     """Return `values` as an array, unless they are ragged or otherwise no array."""
     try:
         return np.asarray(values)
@@ -171,21 +163,21 @@ def check_array(values: object, name: str) -> NDArray[Any]:
         ) from error
 
 
-def check_shape(shape: object) -> tuple[int, int]:
+def shape(value: object) -> tuple[int, int]:
     """Return height and width of ``image.shape``, two or more positive integers."""
-    if not isinstance(shape, (tuple, list)) or len(shape) < 2:
-        raise invalid("shape", "be (height, width, ...)", shape, "pass image.shape")
-    return check_integer(shape[0], "shape[0]", low=1), check_integer(shape[1], "shape[1]", low=1)
+    if not isinstance(value, (tuple, list)) or len(value) < 2:
+        raise invalid("shape", "be (height, width, ...)", value, "pass image.shape")
+    return integer(value[0], "shape[0]", low=1), integer(value[1], "shape[1]", low=1)
 
 
-def check_flags(**flags: object) -> None:
+def flags(**values: object) -> None:
     """Raise unless each value, named by its argument, is a bool, or an integer in place of one."""
-    for name, value in flags.items():
+    for name, value in values.items():
         if not isinstance(value, (bool, int, np.bool_, np.integer)):
             raise InvalidInputError(f"{name} must be True or False; got {describe(value)}")
 
 
-def check_bool(value: object, name: str) -> bool:
+def boolean(value: object, name: str) -> bool:
     """Return `value` as a bool if it is one, of Python or of NumPy."""
     if not isinstance(value, (bool, np.bool_)):
         raise InvalidInputError(f"{name} must be True or False; got {describe(value)}")
@@ -198,7 +190,7 @@ def is_listing(values: object) -> TypeGuard[Iterable[Any]]:
     return isinstance(values, Iterable) and not scalar
 
 
-def check_sequence(values: object, name: str, of: str) -> tuple[Any, ...]:
+def sequence(values: object, name: str, of: str) -> tuple[Any, ...]:
     """Return the items of a sequence or another iterable, but not the characters of a text."""
     if not is_listing(values):
         raise invalid(name, f"be a sequence of {of}", values, "wrap it in a list")
@@ -208,67 +200,59 @@ def check_sequence(values: object, name: str, of: str) -> tuple[Any, ...]:
 _MAX_PIXEL = 1e9  # areas of larger boxes may overflow
 
 
-def check_boxes(boxes: Any, name: str = "boxes") -> NDArray[Any]:
-    """Return `boxes` as an ``(N, 4)`` array of finite boxes with ``x1 <= x2`` and ``y1 <= y2``.
+def boxes(values: Any, name: str = "boxes") -> NDArray[Any]:
+    """Return `values` as an ``(N, 4)`` array of finite boxes with ``x1 <= x2`` and ``y1 <= y2``.
 
-    `boxes` may also be `Detections`, pairs ``((x1, y1), (x2, y2))`` of opposite corners, or an object with an
-    attribute ``xyxy``, such as ``supervision.Detections``.
+    `values` may also be `Detections`, pairs ``((x1, y1), (x2, y2))`` of opposite corners, or an object with
+    an attribute ``xyxy``, such as ``supervision.Detections``.
     """
-    boxes = getattr(boxes, "boxes", boxes)  # Detections have this attribute.
-    array = check_array(getattr(boxes, "xyxy", boxes), name)
-    if array.size == 0:
-        return np.empty((0, 4), array.dtype if array.dtype.kind in "iuf" else np.float64)
-    if array.shape[1:] == (2, 2) and array.dtype.kind in "iuf":
-        array = np.concatenate((array.min(axis=1), array.max(axis=1)), axis=1)
-    if array.ndim != 2 or array.shape[1] != 4 or array.dtype.kind not in "iuf":
+    values = getattr(values, "boxes", values)  # Detections have this attribute.
+    found = array(getattr(values, "xyxy", values), name)
+    if found.size == 0:
+        return np.empty((0, 4), found.dtype if found.dtype.kind in "iuf" else np.float64)
+    if found.shape[1:] == (2, 2) and found.dtype.kind in "iuf":
+        found = np.concatenate((found.min(axis=1), found.max(axis=1)), axis=1)
+    if found.ndim != 2 or found.shape[1] != 4 or found.dtype.kind not in "iuf":
         remedy = "wrap a single box in a list"
-        if hasattr(array.flat[0], "box"):
+        if hasattr(found.flat[0], "box"):
             remedy = "pass [track.box for track in tracks]"
-        elif hasattr(boxes, "astype") and array.dtype == object:
+        elif hasattr(values, "astype") and found.dtype == object:
             remedy = "convert columns that may hold NA with table.astype(float)"
         raise InvalidInputError(
             f"{name} must be an (N, 4) number array of [x1, y1, x2, y2] or corner pairs "
-            f"((x1, y1), (x2, y2)), got {describe(boxes)}; {remedy}"
+            f"((x1, y1), (x2, y2)), got {describe(values)}; {remedy}"
         )
-    if not ((array >= -_MAX_PIXEL) & (array <= _MAX_PIXEL)).all():
-        found = f"values beyond {_MAX_PIXEL:g}" if np.isfinite(array).all() else "NaN or infinity"
-        raise InvalidInputError(f"{name} must be finite, got {found}; drop those rows")
-    inverted = (array[:, 2] < array[:, 0]) | (array[:, 3] < array[:, 1])
+    if not ((found >= -_MAX_PIXEL) & (found <= _MAX_PIXEL)).all():
+        what = f"values beyond {_MAX_PIXEL:g}" if np.isfinite(found).all() else "NaN or infinity"
+        raise InvalidInputError(f"{name} must be finite, got {what}; drop those rows")
+    inverted = (found[:, 2] < found[:, 0]) | (found[:, 3] < found[:, 1])
     if inverted.any():
         row = int(np.argmax(inverted))
         raise InvalidInputError(
-            f"{name} must be [x1, y1, x2, y2] with x1 <= x2 and y1 <= y2, got {array[row].tolist()} in row "
+            f"{name} must be [x1, y1, x2, y2] with x1 <= x2 and y1 <= y2, got {found[row].tolist()} in row "
             f"{row}; boxes given as [x, y, width, height] need x + width and y + height"
         )
-    return array
+    return found
 
 
-def check_number(
+def number(
     value: object, name: str, *, low: float = -math.inf, high: float = math.inf, above: float = -math.inf
 ) -> float:
     """Return `value` as a finite float in ``[low, high]`` and, if given, greater than `above`."""
-    number = math.nan
+    found = math.nan
     if isinstance(value, Real) and not isinstance(value, bool):
         with contextlib.suppress(OverflowError):  # an int of more than 308 digits
-            number = float(value)
-    if not (math.isfinite(number) and low <= number <= high and number > above):
+            found = float(value)
+    if not (math.isfinite(found) and low <= found <= high and found > above):
         bounds = [f"greater than {above:g}"] if above > -math.inf else []
         bounds += [f"at least {low:g}"] if low > -math.inf else []
         bounds += [f"at most {high:g}"] if high < math.inf else []
         expected = " and ".join(bounds) or "finite"
         raise InvalidInputError(f"{name} must be a number, {expected}; got {describe(value)}")
-    return number
+    return found
 
 
-def store_number(instance: object, name: str, **bounds: float) -> None:
-    """Check an attribute of a dataclass; a number of NumPy or a fraction becomes a float."""
-    value = getattr(instance, name)
-    number = check_number(value, name, **bounds)
-    if type(value) not in (int, float):
-        object.__setattr__(instance, name, number)
-
-
-def check_integer(value: object, name: str, *, low: int, high: int | None = None) -> int:
+def integer(value: object, name: str, *, low: int, high: int | None = None) -> int:
     """Return `value` as an int in ``[low, high]``."""
     is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     limit = _MAX_INTEGER if high is None else high
@@ -278,50 +262,9 @@ def check_integer(value: object, name: str, *, low: int, high: int | None = None
     return int(value)  # type: ignore[call-overload, no-any-return]
 
 
-def check_choice(value: Any, name: str, choices: Collection[object]) -> Any:
+def choice(value: Any, name: str, choices: Collection[object]) -> Any:
     """Return `value` if it is one of `choices`."""
     if not (value is None or isinstance(value, (str, int, np.integer))) or value not in choices:
         listed = ", ".join(repr(choice) for choice in choices)
         raise InvalidInputError(f"{name} must be one of {listed}; got {describe(value)}")
     return value
-
-
-def number(default: Any = MISSING, **bounds: float) -> Any:
-    """Declare a number in ``[low, high]`` that is greater than `above`."""
-
-    def check(value: Any, name: str) -> float:
-        found = check_number(value, name, **bounds)
-        return value if type(value) in (int, float) else found  # a number of NumPy becomes a float
-
-    return checked_field(default, check)
-
-
-def integer(default: Any = MISSING, *, low: int, high: int | None = None) -> Any:
-    """Declare an integer in ``[low, high]``."""
-    return checked_field(default, lambda value, name: check_integer(value, name, low=low, high=high))
-
-
-def flag(default: bool) -> Any:
-    """Declare True or False."""
-    return checked_field(default, check_bool)
-
-
-def choice(default: Any, choices: Collection[Any]) -> Any:
-    """Declare one of several values."""
-    return checked_field(default, lambda value, name: check_choice(value, name, choices))
-
-
-def checked_field(default: Any, check: Callable[[Any, str], Any]) -> Any:
-    """Declare a field with the value of ``check(value, name)``; None passes if it is the default."""
-    return dataclasses.field(default=default, metadata={"check": check})
-
-
-@dataclass(frozen=True, kw_only=True)
-class Checked:
-    """Base of the parameter classes: frozen, and checked when they are made."""
-
-    def __post_init__(self) -> None:
-        for each in dataclasses.fields(self):
-            value = getattr(self, each.name)
-            if "check" in each.metadata and not (value is None and each.default is None):
-                object.__setattr__(self, each.name, each.metadata["check"](value, each.name))

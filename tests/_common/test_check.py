@@ -9,20 +9,7 @@ import numpy as np
 import pandas
 import pytest
 
-from vehicle_detection._common import (
-    check_array,
-    check_bool,
-    check_boxes,
-    check_choice,
-    check_image,
-    check_integer,
-    check_number,
-    check_patches,
-    check_path,
-    check_type,
-    describe,
-    store_number,
-)
+from vehicle_detection._common import check, describe, store_number
 from vehicle_detection.boxes import Detections
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
@@ -60,22 +47,22 @@ def test_values_that_python_refuses_to_print():
     assert describe(10**5000) == "a value too long to print (int)"
     assert describe(nested) == "a value too long to print (list)"
     with pytest.raises(InvalidInputError, match="must be an integer at least 1; got a value too long"):
-        check_integer(10**5000, "n", low=1)
+        check.integer(10**5000, "n", low=1)
 
 
 def test_a_long_name_is_shortened():
     with pytest.raises(InvalidInputError, match=r"got 'a{76}\.\.\. with more than 255 bytes"):
-        check_path(Path("a" * 300))
+        check.path(Path("a" * 300))
 
 
 def test_arrays_that_fit_are_returned():
     boxes = np.array([[0, 1, 2, 3], [5, 5, 5, 5]], np.int16)
     batch = np.stack([PATCH, PATCH + 1])
-    assert check_image(IMAGE) is IMAGE
-    assert check_boxes(boxes) is boxes
-    assert check_boxes([[0.5, 1, 2, 3]]).dtype == np.float64
-    assert check_patches(batch, 64) is batch
-    assert check_patches(PatchSet(batch, [0, 1], ["a/b/c.png"] * 2), 64) is batch
+    assert check.image(IMAGE) is IMAGE
+    assert check.boxes(boxes) is boxes
+    assert check.boxes([[0.5, 1, 2, 3]]).dtype == np.float64
+    assert check.patches(batch, 64) is batch
+    assert check.patches(PatchSet(batch, [0, 1], ["a/b/c.png"] * 2), 64) is batch
 
 
 @pytest.mark.parametrize(
@@ -106,14 +93,14 @@ def test_arrays_that_fit_are_returned():
 )
 def test_check_image_explains_the_conversion(image, remedy):
     with pytest.raises(InvalidInputError, match=rf"^frame must be an \(H, W, 3\) uint8 RGB array.*{remedy}"):
-        check_image(image, "frame")
+        check.image(image, "frame")
 
 
 def test_check_patches_stacks_a_list():
     batch = np.stack([PATCH, PATCH + 1])
-    np.testing.assert_array_equal(check_patches([PATCH, PATCH + 1], 64), batch)
-    assert check_patches([], 64).shape == (0, 64, 64, 3)
-    assert check_patches(np.empty((0, 32, 32, 3), np.uint8), 32).dtype == np.uint8
+    np.testing.assert_array_equal(check.patches([PATCH, PATCH + 1], 64), batch)
+    assert check.patches([], 64).shape == (0, 64, 64, 3)
+    assert check.patches(np.empty((0, 32, 32, 3), np.uint8), 32).dtype == np.uint8
 
 
 @pytest.mark.parametrize(
@@ -135,18 +122,18 @@ def test_check_patches_stacks_a_list():
 )
 def test_check_patches_refuses(patches, message):
     with pytest.raises(InvalidInputError, match=message):
-        check_patches(patches, 64)
+        check.patches(patches, 64)
 
 
 @pytest.mark.parametrize("empty", [[], np.empty((0, 4)), np.empty(0), (), np.empty((0, 4), np.int64)])
 def test_check_boxes_accepts_no_boxes(empty):
-    assert check_boxes(empty).shape == (0, 4)
+    assert check.boxes(empty).shape == (0, 4)
 
 
 def test_check_boxes_accepts_corner_pairs_and_detections():
     boxes = [[1, 2, 3, 4], [0, 0, 5, 6]]
-    np.testing.assert_array_equal(check_boxes([((1, 2), (3, 4)), ((5, 6), (0, 0))]), boxes)
-    np.testing.assert_array_equal(check_boxes(Detections(boxes, [1, 2])), boxes)
+    np.testing.assert_array_equal(check.boxes([((1, 2), (3, 4)), ((5, 6), (0, 0))]), boxes)
+    np.testing.assert_array_equal(check.boxes(Detections(boxes, [1, 2])), boxes)
 
 
 @pytest.mark.parametrize(
@@ -169,7 +156,7 @@ def test_check_boxes_accepts_corner_pairs_and_detections():
 )
 def test_check_boxes_refuses(boxes, message):
     with pytest.raises(InvalidInputError, match=f"^windows .*{message}"):
-        check_boxes(boxes, "windows")
+        check.boxes(boxes, "windows")
 
 
 def test_the_reason_why_an_array_cannot_be_converted_is_kept():
@@ -177,21 +164,21 @@ def test_the_reason_why_an_array_cannot_be_converted_is_kept():
         def __array__(self, *_, **__):
             raise TypeError("Use Tensor.cpu() first.")
 
-    for check in (check_array, check_boxes):
+    for function in (check.array, check.boxes):
         with pytest.raises(InvalidInputError, match=r"^x must .*Tensor.*; Use Tensor.cpu\(\)") as caught:
-            check(Tensor(), "x")
+            function(Tensor(), "x")
         assert isinstance(caught.value.__cause__, TypeError)
 
 
 def test_check_type():
-    check_type(True, "n", int, "count them")
+    check.instance(True, "n", int, "count them")
     with pytest.raises(InvalidInputError, match=r"^n must be a int, got 'a'; count them$"):
-        check_type("a", "n", int, "count them")
+        check.instance("a", "n", int, "count them")
 
 
 @pytest.mark.parametrize("value", [0, 1, 0.5, np.float32(0.5), np.int64(1), Fraction(1, 4), 1e-300])
 def test_check_number_accepts_numbers_in_range(value):
-    number = check_number(value, "fraction", low=0, high=1)
+    number = check.number(value, "fraction", low=0, high=1)
     assert type(number) is float
     assert number == value
 
@@ -206,17 +193,17 @@ def test_stored_numbers_are_those_of_python():
 
 
 def test_check_bool():
-    assert check_bool(np.bool_(True), "mirror") is True
+    assert check.boolean(np.bool_(True), "mirror") is True
     for value in (1, "yes", None, np.int64(1)):
         with pytest.raises(InvalidInputError, match="mirror must be True or False; got"):
-            check_bool(value, "mirror")
+            check.boolean(value, "mirror")
 
 
 @pytest.mark.parametrize("value", [-0.01, 1.01, math.nan, math.inf, -math.inf, "0.5", None, True, [0.5], 1j])
 def test_check_number_refuses(value):
     expected = re.escape(f"fraction must be a number, at least 0 and at most 1; got {describe(value)}")
     with pytest.raises(InvalidInputError, match=expected):
-        check_number(value, "fraction", low=0, high=1)
+        check.number(value, "fraction", low=0, high=1)
 
 
 @pytest.mark.parametrize(
@@ -230,23 +217,23 @@ def test_check_number_refuses(value):
 )
 def test_check_number_describes_the_bounds(value, bounds, expected):
     with pytest.raises(InvalidInputError, match=f"fps must be a number, {expected}$"):
-        check_number(value, "fps", **bounds)
+        check.number(value, "fps", **bounds)
 
 
 def test_check_integer():
     for value in (1, 5, np.int8(3), np.uint64(4)):
-        assert type(check_integer(value, "n", low=1, high=5)) is int
-    assert check_integer(10**12, "n", low=1) == 10**12
+        assert type(check.integer(value, "n", low=1, high=5)) is int
+    assert check.integer(10**12, "n", low=1) == 10**12
     for value in (0, 6, 2.0, "2", True, None, math.nan):
         with pytest.raises(InvalidInputError, match="n must be an integer from 1 to 5; got"):
-            check_integer(value, "n", low=1, high=5)
+            check.integer(value, "n", low=1, high=5)
     with pytest.raises(InvalidInputError, match=r"n must be an integer at least 1; got -3$"):
-        check_integer(-3, "n", low=1)
+        check.integer(-3, "n", low=1)
 
 
 @pytest.mark.parametrize("value", ["c", None, ["a"], {}, np.zeros(3), np.array(["a", "b"])])
 @pytest.mark.parametrize("choices", [("a", "b"), {"a": 1, "b": 2}])
 def test_check_choice_lists_the_choices(value, choices):
-    check_choice("a", "mode", choices)
+    check.choice("a", "mode", choices)
     with pytest.raises(InvalidInputError, match=r"mode must be one of 'a', 'b'; got"):
-        check_choice(value, "mode", choices)
+        check.choice(value, "mode", choices)
