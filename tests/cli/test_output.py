@@ -1,7 +1,4 @@
-import io
 import os
-import re
-import sys
 
 import pytest
 
@@ -11,29 +8,17 @@ from vehicle_detection.cli.output import check_distinct_paths, print_error, prin
 from vehicle_detection.errors import InvalidInputError
 
 
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-def test_lines_are_wrapped_at_spaces_in_a_terminal_only(monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", "24")
-    text = "warning: /a/path/that/is/too/long/to/fit\nis used"
+def test_a_line_is_printed_above_a_progress_bar(capsys):
     with progress_bar(True, 5, unit="frame"):
-        print_error(text)
-        assert "warning: /a/path/that/is/too/long/to/fit is used\n" in capsys.readouterr().err
-        monkeypatch.setattr(sys, "stderr", Terminal())
-        print_error(text)
-    assert "warning:\n  /a/path/that/is/too/long/to/fit\n  is used\n" in sys.stderr.getvalue()
-    monkeypatch.setattr(sys, "stdout", Terminal())
-    output.print_facts("data", {"sources": "GTI 3900, KITTI 5966", "n": 1})
-    printed = re.sub(r"\x1b\[[\d;]*m", "", sys.stdout.getvalue())
-    assert printed == "data\n  sources  GTI 3900,\n           KITTI 5966\n  n        1\n"
+        print_error("warning: a/path\nis used")
+    assert "warning: a/path is used\n" in capsys.readouterr().err
+    output.print_facts("data", {"sources": "GTI 3900", "n": 1})
+    assert capsys.readouterr().out == "data\n  sources  GTI 3900\n  n        1\n"
 
 
 @pytest.mark.parametrize("width", [80, 50, 41])
 def test_a_table_breaks_no_word(monkeypatch, capsys, width):
-    monkeypatch.setattr(output, "_terminal_width", lambda stream: width)
+    monkeypatch.setattr(output, "_PIPE_WIDTH", width)
     japanese = "\u8eca\u4e21\u30c7.mp4"  # each of these three characters takes two columns
     words = [japanese, "false negatives", "near duplicates", "0.954", "KITTI and Extras"]
     print_table("scores", ["tested on", *words[1:3]], [[words[0], "0.954", "1"], [words[4], "1", "2"]])

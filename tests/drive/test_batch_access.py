@@ -213,7 +213,7 @@ def test_the_identity_of_a_url_does_not_depend_on_what_is_hidden_in_its_record()
     url = "ftp://anna:secret@host/20260131_093000_F.mp4"
     (found,) = plan.group_files([url], "trip")
     task = plan.plan_trip(found, {url: {"size": 1}}, {"options": {}}, "")
-    assert task["key"].partition("-")[0] == plan.source_id(url) == plan.trip_id(found)
+    assert task["key"].partition("-")[0] == plan.source_id(url) == plan.source_id(str(found.files[0]))
     assert "secret" not in task["sources"][0]["uri"]
 
 

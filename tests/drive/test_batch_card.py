@@ -12,7 +12,7 @@ from vehicle_detection.video import probe_video
 
 pytestmark = pytest.mark.usefixtures("private_scratch")
 
-FRAMES, SEGMENTS = 25, 6
+FRAMES, SEGMENTS = 25, 4
 
 
 def test_a_card_of_many_segments_is_one_trip_with_one_identity_per_vehicle(tmp_path):

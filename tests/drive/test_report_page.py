@@ -32,6 +32,7 @@ from vehicle_detection.drive import Event, OwnSpeed, ReportWriter, TrackPicture
 from vehicle_detection.drive import report as page
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.svm import load_classifier
+from vehicle_detection.tables import TrackTable
 from vehicle_detection.tracking import TrackParams
 
 UNSAFE_NAME = "\"><img src=x onerror=alert(1)>&amp;'</title><script>.mp4"
@@ -213,8 +214,9 @@ class TestPage:
     def test_the_page_of_an_hour_of_video_is_small(self, tmp_path):
         frames = 90_000
         report = ReportWriter(tmp_path / "report.html")
-        for index in range(frames):
-            report.table.append(index, None, [track(1 + index // 900, distance=10 + index % 900 / 10)])
+        index = np.arange(frames)
+        columns = {"distance_m": 10 + index % 900 / 10, "distance_std_m": np.full(frames, 2.0)}
+        report.table = TrackTable(index, 1 + index // 900, np.full((frames, 4), 9.0), **columns)
         report.finish(video_report(frames))
         text = (tmp_path / "report.html").read_text()
         assert len(text) < 300_000

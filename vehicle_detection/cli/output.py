@@ -9,7 +9,6 @@ import os
 import re
 import sys
 import tempfile
-import textwrap
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
@@ -33,7 +32,6 @@ Result = TypeVar("Result")
 # Name of a thread that `run_interruptible` has abandoned.
 _ABANDONED = "abandoned"
 
-_USUAL_WIDTH = 80  # of a terminal that does not state its own
 # Width of tables that are not printed to a terminal; fits a fingerprint in one line.
 _PIPE_WIDTH = 120
 
@@ -53,43 +51,13 @@ def printable(text: str) -> str:
     return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
-def print_line(text: str, *, err: bool = False, indent: int = 2, bold: bool = False) -> None:
-    """Print a text; in a terminal, above progress bars, and wrapped at spaces with an indent."""
+def print_line(text: str, *, err: bool = False, bold: bool = False) -> None:
+    """Print a text; in a terminal, above progress bars."""
     stream = sys.stderr if err else sys.stdout
-    text = typer.style(printable(text), bold=True) if bold else printable(text)
-    if (width := _terminal_width(stream)) is None:
-        typer.echo(text, err=err)
-        return
-    options: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
-    options["subsequent_indent"] = " " * (indent if 2 * indent < width else 2)
-    lines = [
-        "\n".join(textwrap.wrap(line, width, **options)) if _cells(line) > width else line
-        for line in text.split("\n")
-    ]
     tqdm = sys.modules.get("tqdm")  # unless it is imported, there is no bar
-    with tqdm.tqdm.external_write_mode(stream) if tqdm else contextlib.nullcontext():
-        typer.echo("\n".join(lines), err=err)
-
-
-def _cells(text: str) -> int:
-    """Columns of a terminal that a text takes; some characters take two, escape codes none."""
-    if text.isascii() and "\x1b" not in text:
-        return len(text)
-    from rich.text import Text
-
-    return Text.from_ansi(text).cell_len
-
-
-def _terminal_width(stream: Any) -> int | None:
-    """Columns of a terminal; None for other streams."""
-    if stream is None or not stream.isatty():  # None: closed
-        return None
-    columns = os.environ.get("COLUMNS", "")
-    if columns.isdecimal() and int(columns):
-        return int(columns)
-    with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor
-        return os.get_terminal_size(stream.fileno()).columns or _USUAL_WIDTH
-    return _USUAL_WIDTH
+    bars = tqdm is not None and stream is not None and stream.isatty()  # None: closed
+    with tqdm.tqdm.external_write_mode(stream) if bars else contextlib.nullcontext():  # type: ignore[union-attr]
+        typer.echo(typer.style(printable(text), bold=True) if bold else printable(text), err=err)
 
 
 def print_error(message: str) -> None:
@@ -147,23 +115,26 @@ def option_names(**options: str) -> Iterator[None]:
 def print_table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print a table, with columns of numbers aligned to the right."""
     from rich import box
+    from rich.cells import cell_len
     from rich.console import Console
     from rich.table import Table
 
-    terminal = _terminal_width(sys.stdout)
+    console = Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH, highlight=False, markup=False)
     rows = [[printable(cell) for cell in row] for row in rows]
     table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
     columns = list(zip(heads, *rows))
     # Lines break at spaces only, if the longest words fit beside each other.
-    words = [max((_cells(word) for cell in column for word in cell.split()), default=0) for column in columns]
-    fit = terminal is None or sum(words) + 3 * len(words) < terminal
+    words = [
+        max((cell_len(word) for cell in column for word in cell.split()), default=0) for column in columns
+    ]
+    fit = sum(words) + 3 * len(words) < console.width
     for (head, *cells), longest in zip(columns, words):
         numeric = all(cell.replace(",", "").rstrip("%").replace(".", "").isdigit() for cell in cells)
         justify: Literal["left", "right"] = "right" if numeric and rows else "left"
         table.add_column(head, justify=justify, overflow="fold", min_width=longest if fit else None)
     for row in rows:
         table.add_row(*row)
-    Console(width=terminal or _PIPE_WIDTH, highlight=False, markup=False).print(table)
+    console.print(table)
 
 
 def print_facts(title: str, facts: Mapping[str, Any]) -> None:
@@ -173,7 +144,7 @@ def print_facts(title: str, facts: Mapping[str, Any]) -> None:
     for name, value in facts.items():
         nested = isinstance(value, Mapping)
         text = ", ".join(f"{key} {entry}" for key, entry in value.items()) if nested else str(value)
-        print_line(f"  {name:<{width}}  {text}", indent=width + 4)
+        print_line(f"  {name:<{width}}  {text}")
 
 
 def refuse_if(wrong: object, message: str) -> None:

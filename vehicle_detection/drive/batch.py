@@ -38,7 +38,6 @@ from vehicle_detection.drive.batch_plan import (
     shipped_model,
     source_id,
     trip_digest,
-    trip_id,
 )
 from vehicle_detection.drive.batch_store import (
     COUNTS,
@@ -246,13 +245,6 @@ def run_batch(
     return BatchReport(**numbers, seconds=seconds, messages=messages, planned=planned)
 
 
-def _check_callables(executor: object, on_record: object) -> None:
-    if executor is not None and not hasattr(executor, "submit"):
-        raise invalid("executor", "be an executor of concurrent.futures", executor, "omit it")
-    if on_record is not None and not callable(on_record):
-        raise InvalidInputError(f"on_record must be a function of a record; got {describe(on_record)}")
-
-
 def _parse_shard(shard: object) -> tuple[int, int]:
     if shard is None:
         return 1, 1
@@ -282,15 +274,10 @@ def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -
     settings = {"model": name, "options": given, **others}
     try:
         json.dumps(settings)
-    except TypeError as error:
-        raise invalid("options", "hold numbers, strings, lists and None", options, f"{error}") from None
-    try:
         open_detector(name, **given).close()  # an error now, not in every worker
     except TypeError as error:
-        raise InvalidInputError(
-            "options must be classes, device, conf, camera, fov, camera_height, horizon, every or blur; "
-            f"{error}"
-        ) from None
+        names = "classes, device, conf, camera, fov, camera_height, horizon, every or blur"
+        raise InvalidInputError(f"options must be values of JSON for {names}; {error}") from None
     return settings
 
 
@@ -308,7 +295,7 @@ def _plan(
         earlier.setdefault(identity_of(key), []).append(key)
     number, count = part
     tasks = []
-    mine = [trip for trip in trips if int(trip_id(trip), 16) % count == number - 1]
+    mine = [trip for trip in trips if int(source_id(str(trip.files[0])), 16) % count == number - 1]
     with ThreadPoolExecutor(_LOOKUPS, thread_name_prefix="vehicle-plan") as pool:
         plans = list(pool.map(lambda trip: plan_trip(trip, listed, settings, fingerprint), mine))
     longer = _longer_records(plans, earlier, store)

@@ -112,11 +112,6 @@ def group_files(files: Sequence[str], group: str) -> list[Trip]:
     return find_trips(named)
 
 
-def trip_id(trip: Trip) -> str:
-    """Identity of a trip for any contents and parameters: that of its first file."""
-    return source_id(str(trip.files[0]))
-
-
 def source_id(uri: str) -> str:
     """Identity of a file: a hash of its path or URL, which a new password or signature does not change."""
     named = stable_url(uri) if is_url(uri) else uri
@@ -137,7 +132,7 @@ def plan_trip(
     facts = [_identify(file, known.get(file, {})) for file in files]
     sources = [{"uri": uri, **each} for uri, each in zip(shown, facts)]
     return {
-        "key": f"{trip_id(trip)}-{trip_digest(sources, settings, fingerprint)}",
+        "key": f"{source_id(files[0])}-{trip_digest(sources, settings, fingerprint)}",
         "files": files,
         "sources": sources,
         "camera": trip.camera,

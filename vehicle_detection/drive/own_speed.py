@@ -267,18 +267,15 @@ def _read_csv(data: bytes, name: str) -> Floats:
     for number, row in enumerate(table[1:], start=2):
         if not any(cell.strip() for cell in row):
             continue
+        where = f"path {name}, line {number}"
         try:
             time, speed = (float(row[header.index(column)]) for column in ("time_s", unit))
         except (ValueError, IndexError):
-            raise InvalidInputError(
-                f"path {name}, line {number}: time_s and {unit} must be numbers; correct the line"
-            ) from None
+            raise InvalidInputError(f"{where}: time_s and {unit} must be numbers; correct the line") from None
         speed *= _SPEED_COLUMNS[unit]
         if not math.isfinite(time) or not 0 <= speed <= _MAX_SPEED:
-            raise InvalidInputError(
-                f"path {name}, line {number}: the speed must be from 0 to {_MAX_SPEED:g} m/s at a finite "
-                f"time; got {shorten(','.join(row))}"
-            )
+            expected = f"the speed must be from 0 to {_MAX_SPEED:g} m/s at a finite time"
+            raise InvalidInputError(f"{where}: {expected}; got {shorten(','.join(row))}")
         cells = [row[column] if column < len(row) else "" for column in place]
         rows.append((time, speed, *(_position(*cells) if len(cells) == 2 else _NOWHERE)))
     if not rows:
