@@ -19,10 +19,13 @@ from vehicle_detection import (
     track,
     write_tracks,
 )
+from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.camera import Camera
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image, write_image
+from vehicle_detection.results import image_distances
+from vehicle_detection.scenes import render_drive
 
 ROAD, OTHER = "test_images/road1.jpg", "test_images/road2.jpg"
 
@@ -151,6 +154,38 @@ def test_distances_need_a_camera(detector):
     assert near.shape == (2, len(found))
     assert (far[0] > 1.5 * near[0]).all()
     assert (near[1] > 0).all()
+
+
+def test_a_known_lens_gives_distances_without_a_horizon(detector, expected):
+    camera = Camera.dashcam(fov=60)
+    with Detector("highway", camera=camera) as measuring:
+        found = measuring.detect(ROAD)
+    true = expected[0].distances(Camera.dashcam(fov=60, horizon=0.55))[0]
+    assert (np.abs(found.distances_m - true) < 2 * found.distance_stds_m).all()
+    np.testing.assert_array_equal(found[1:].to_pandas()["distance_m"], found.distances_m[1:])
+    assert TrackTable.from_detections([found])["distance_std_m"].tolist() == found.distance_stds_m.tolist()
+    assert expected[0].distances_m is None
+    assert "distance_m" not in expected[0].to_pandas()
+
+
+def test_stated_errors_of_images_hold_without_a_horizon():
+    """Near and far vehicles of rendered drives, whose boxes have the errors of a detector."""
+    errors, stated = [], []
+    rng = np.random.default_rng(0)
+    for seed, scenario in enumerate(("traffic", "passing", "occlusion")):
+        drive = render_drive(frames=61, scenario=scenario, rough=True, random_state=seed, focal_px=900.0)
+        for number in range(0, 61, 20):
+            truth = drive.labels.frame(number)
+            truth = truth[~truth["ignore"]]
+            sides = np.tile(truth.boxes[:, 2:] - truth.boxes[:, :2], 2)
+            boxes = clip_boxes(truth.boxes + 0.03 * sides * rng.normal(size=sides.shape), (720, 1280))
+            found = Detections(boxes, np.full(len(boxes), 3.0))
+            camera = Camera.dashcam(fov=np.degrees(2 * np.arctan(640 / 900)))
+            distance, std = image_distances(found, (720, 1280), camera)
+            stated += np.isfinite(distance).tolist()
+            errors += (np.abs(distance - truth["distance_m"]) / std)[np.isfinite(distance)].tolist()
+    assert np.mean(stated) > 0.9
+    assert 0.9 < np.mean(np.array(errors) < 2) <= 1
 
 
 def test_files_are_read_again_for_the_picture(detector, tmp_path):

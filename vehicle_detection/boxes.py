@@ -209,7 +209,7 @@ class Detections:
             return NotImplemented
         if not len(self) or not len(other):  # without boxes, nothing is unknown
             return self if len(self) else other
-        pairs = {name: (getattr(self, name), getattr(other, name)) for name in _COLUMNS}
+        pairs = {name: (getattr(self, name), getattr(other, name, None)) for name in _columns(self)}
         return self.with_columns(
             **{
                 name: None if first is None or second is None else np.concatenate([first, second])
@@ -233,7 +233,7 @@ class Detections:
     def __getitem__(self, rows: int | slice | NDArray[Any] | list[int]) -> Self:
         """Take one row by its index, or several by a slice, a mask or a list of indices."""
         taken = [rows] if isinstance(rows, (int, np.integer)) else rows
-        columns = ((name, getattr(self, name)) for name in _COLUMNS)
+        columns = ((name, getattr(self, name)) for name in _columns(self))
         return self.with_columns(**{name: None if each is None else each[taken] for name, each in columns})
 
     def __iter__(self) -> Iterator[tuple[NDArray[Any], float]]:
@@ -241,7 +241,10 @@ class Detections:
         return zip(self.boxes, self.scores.tolist())
 
 
-_COLUMNS = tuple(Detections.__dataclass_fields__)
+def _columns(detections: Detections) -> list[str]:
+    """Names of the columns, also those of a subclass, whose other fields say that they are none."""
+    fields = type(detections).__dataclass_fields__.items()
+    return [name for name, each in fields if each.metadata.get("column", True)]
 
 
 def _score_column(values: ArrayLike, name: str, count: int | None = None) -> Floats:

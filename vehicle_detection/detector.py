@@ -33,7 +33,7 @@ from vehicle_detection.heatmap import HeatHistory, HeatParams, frame_heat, label
 from vehicle_detection.images import image_array, list_images
 from vehicle_detection.network import Device, NetworkModel, load_network
 from vehicle_detection.regions import RegionParams, find_vehicles
-from vehicle_detection.results import ImageDetections
+from vehicle_detection.results import ImageDetections, image_distances
 from vehicle_detection.search import FrameSearch, SearchResult
 from vehicle_detection.svm import VehicleClassifier, load_classifier
 from vehicle_detection.tracking import FrameResult, SceneCuts, Tracker, TrackParams
@@ -265,7 +265,8 @@ class Detector(Closing):
         Returns
         -------
         ImageDetections
-            Boxes in pixels of the image, with scores and, unless they come from a heat map, confidences.
+            Boxes in pixels of the image, with scores and, unless they come from a heat map, confidences; with
+            distances if the lens of `camera` is known.
         """
         limit = None if conf is None else _check_confidence(conf, self.region_params)
         if limit is not None and not isinstance(self.model, VehicleClassifier):
@@ -292,7 +293,11 @@ class Detector(Closing):
         if not isinstance(self.model, VehicleClassifier):
             vehicles = vehicles.with_columns(scores=vehicles.scores - lowest)
         found = ImageDetections.from_columns(vehicles.boxes, vehicles.scores)
-        return found.with_columns(**vars(vehicles), source=image)
+        found = found.with_columns(**vars(vehicles), source=image)
+        if not self.camera.lens_is_known:
+            return found
+        distances, stds = image_distances(found, frame.shape, self.camera)
+        return found.with_columns(distances_m=distances, distance_stds_m=stds)
 
     def close(self) -> None:
         """Stop the search's threads; they start again when it is used."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import importlib
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import image_array, write_image
 from vehicle_detection.tracking import Tracker
 
+if TYPE_CHECKING:
+    import pandas
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ImageDetections(Detections):
@@ -29,6 +32,9 @@ class ImageDetections(Detections):
     source
         The image that `detect` was given: an array, which is not copied; a file, which is read again when the
         picture is needed; or its content.
+    distances_m, distance_stds_m
+        ``(N,)`` distances and their standard errors in meters, as of `distances`, NaN where unknown; None
+        unless the detector has a camera with a known lens.
 
     Examples
     --------
@@ -38,7 +44,9 @@ class ImageDetections(Detections):
     (2, 'road1.jpg', (720, 1280, 3))
     """
 
-    source: Any = None
+    source: Any = field(default=None, metadata={"column": False})
+    distances_m: Floats | None = None
+    distance_stds_m: Floats | None = None
 
     @property
     def path(self) -> Path | None:
@@ -54,13 +62,15 @@ class ImageDetections(Detections):
     def distances(self, camera: Camera) -> Floats:
         """Distances along the road and their standard errors in meters, ``(2, N)``; NaN where unknown.
 
-        One image does not show the horizon: with that of the `camera` unknown, the errors are large.
+        If that of the `camera` is unknown, the horizon is estimated from the vehicles of the image, which few
+        vehicles show with a large error. A vehicle of which only the side is visible needs the horizon.
         """
-        shape, values = self.image.shape, np.full((2, len(self)), np.nan)
-        for row in range(len(self)):
-            for track in Tracker(camera=camera).update(self[[row]], shape):
-                values[:, row] = track.distance_m, track.distance_std_m  # None becomes NaN
-        return values
+        return image_distances(self, self.image.shape, camera)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a table with a row for each box, as `Detections.to_pandas`, with distances if known."""
+        known = {"distance_m": self.distances_m, "distance_std_m": self.distance_stds_m}
+        return super().to_pandas().assign(**{name: each for name, each in known.items() if each is not None})
 
     def plot(self, **options: Any) -> NDArray[np.uint8]:
         """Return the image with its vehicles; the options are those of `draw_detections`."""
@@ -79,3 +89,17 @@ class ImageDetections(Detections):
             importlib.import_module("IPython.display").display(picture)
         elif not ImageShow.show(picture, "vehicles"):
             raise InvalidInputError("show needs a viewer of pictures, and found none; use save(path)")
+
+
+def image_distances(found: Detections, shape: tuple[int, ...], camera: Camera) -> Floats:
+    """Distances and standard errors of the vehicles of one image, as `ImageDetections.distances`."""
+    values = np.full((2, len(found)), np.nan)
+    # At one frame per second, frames share no errors, as if there was one.
+    if not camera.horizon_is_known and not camera.fisheye:
+        tracker = Tracker(camera=camera, fps=1)
+        tracker.update(found, shape)
+        camera = tracker.camera
+    for row in range(len(found)):
+        for track in Tracker(camera=camera, fps=1).update(found[[row]], shape):
+            values[:, row] = track.distance_m, track.distance_std_m  # None becomes NaN
+    return values

@@ -74,6 +74,8 @@ _COLUMNS = {
     "ignore": _Column(False),
 }
 """All columns except ``frame`` and the corners of the boxes."""
+_OF_DETECTIONS = {"confidence": "confidences", "label": "labels"}
+_OF_DETECTIONS |= {"distance_m": "distances_m", "distance_std_m": "distance_stds_m"}
 _CORNER = _Column(math.nan, -_ABSURD, _ABSURD, f"a number of pixels up to {_ABSURD:g}")
 
 _NUMBERS = (*TRACK_VALUES[:-1], "time_since_update")  # values of a `Track`
@@ -100,10 +102,9 @@ class TrackTable:
         All frames, including those without a box; the frames of the rows are added.
     **columns
         Other columns, ``(N,)`` or None: ``score``, ``confidence``, ``distance_m``, ``distance_std_m``,
-        ``speed_mps`` and ``speed_std_mps`` of tracks and detections, NaN where a value is unknown; ``label``,
-        the class, ``"vehicle"`` if unknown; ``time_since_update`` (s) of tracks, only in memory; and
-        ``occluded`` (0 visible, 1 partly, 2 largely hidden), ``truncated`` (fraction outside the image) and
-        ``ignore`` (not scored; with track -1 a region) of labels. A table without ``score`` holds labels.
+        ``speed_mps`` and ``speed_std_mps``, NaN where a value is unknown; ``label``, the class, ``"vehicle"``
+        if unknown; ``time_since_update`` (s), only in memory; and of labels, which have no ``score``,
+        ``occluded`` (0 visible, 1 partly, 2 largely), ``truncated`` (fraction) and ``ignore`` (not scored).
 
     Examples
     --------
@@ -182,16 +183,18 @@ class TrackTable:
         for key, found in detections.items():
             check.instance(found, f"detections[{key!r}]", Detections, "pass Detections(boxes, scores)")
         parts = [Detections.empty(), *detections.values()]
-        unknown = [np.full(len(found), np.nan) for found in parts]
-        known = [gap if each.confidences is None else each.confidences for each, gap in zip(parts, unknown)]
-        kinds = [np.full(len(each), UNKNOWN_LABEL) if each.labels is None else each.labels for each in parts]
+        columns = {}
+        for name, attribute in _OF_DETECTIONS.items():
+            values = [getattr(each, attribute, None) for each in parts]
+            if name == "confidence" or any(each is not None for each in values):
+                gaps = [np.full(len(each), _COLUMNS[name].missing) for each in parts]
+                columns[name] = np.concatenate([g if v is None else v for g, v in zip(gaps, values)])
         return cls(
             [key for key, found in detections.items() for _ in range(len(found))],
             None,
             np.concatenate([found.boxes for found in parts]),
             score=np.concatenate([found.scores for found in parts]),
-            confidence=np.concatenate(known),
-            label=np.concatenate(kinds) if any(each.labels is not None for each in parts) else None,
+            **columns,
             frame_keys=tuple(detections),
         )
 
@@ -214,9 +217,8 @@ class TrackTable:
     def from_pandas(cls, table: pandas.DataFrame, *, classes: Collection[str] | None = None) -> TrackTable:
         """Take the boxes of a table with the columns of `to_pandas`; only frame and corners are required.
 
-        So ``pandas.read_csv`` of a file that `write_tracks` wrote is such a table. A missing track is -1, and
-        missing occlusion, truncation and `ignore` are 0. As in `read_labels`, a column ``class``, ``label``
-        or ``category`` of names selects vehicles: those of `classes`, or car, van, truck, bus and vehicle.
+        ``pandas.read_csv`` of a file of `write_tracks` is such a table. A missing track is -1, other missing
+        values are 0. A column ``class``, ``label`` or ``category`` selects vehicles as in `read_labels`.
         """
         if not hasattr(table, "iloc") or not hasattr(table, "columns"):
             remedy = "; convert it with table.to_pandas()" if hasattr(table, "to_pandas") else ""
@@ -241,8 +243,7 @@ class TrackTable:
     def append(self, frame: Any, time: float | None = None, tracks: Iterable[Any] = ()) -> None:
         """Add the shown tracks of the next frame.
 
-        `frame` is a :class:`FrameResult`, or its number, counted from 0 and ascending, with its `time` in the
-        source in seconds, if known, and its `tracks`; those that are not shown are skipped.
+        `frame` is a :class:`FrameResult`, or its number, ascending from 0, with its `time` (s) and `tracks`.
         """
         if is_result(frame):
             frame, time, tracks = frame.index, getattr(frame, "time", None), frame.tracks
@@ -382,7 +383,7 @@ class TrackTable:
     def times(self) -> Floats | None:
         """Time (s) of each frame from 0 to the last one, interpolated where it is unknown or does not ascend.
 
-        None if that is so for most frames, for the first one or for the last one, and for frames with names.
+        None if that is so for most frames, for the first or the last one, and for frames with names.
         """
         if not self._times:
             return None
@@ -397,10 +398,7 @@ class TrackTable:
         return np.asarray(np.interp(np.arange(times.size), rows, times[rows]))
 
     def renamed(self, rename: Callable[[Any], FrameKey]) -> TrackTable:
-        """Return a copy, without times, in which ``rename(key)`` replaces every frame key.
-
-        Its `first_time` is None.
-        """
+        """Return a copy, without times, in which ``rename(key)`` replaces every frame key."""
         if not callable(rename):
             raise InvalidInputError(f"rename must be a function of a frame key; got {describe(rename)}")
         frames, keys = ([rename(key) for key in each] for each in (self["frame"].tolist(), self._keys))

@@ -1,5 +1,7 @@
 import re
 import shutil
+import threading
+import time
 from pathlib import Path
 
 import cv2
@@ -10,8 +12,9 @@ from tests.cli.commands import HEADER, contents, refuse, refuse_each, run, succe
 from tests.network.graphs import constant_network
 from tests.video.clips import write_clip
 from vehicle_detection import detector
-from vehicle_detection.boxes import Detections
+from vehicle_detection.formats import read_labels
 from vehicle_detection.images import read_image, write_image
+from vehicle_detection.results import ImageDetections
 from vehicle_detection.scenes import SceneVehicle, render_scene
 from vehicle_detection.video import read_frames
 
@@ -24,14 +27,14 @@ def road(*places, **options):
 
 def test_detect_writes_annotated_images_and_boxes(monkeypatch, picture, tmp_path):
     found = [
-        Detections([[10, 20, 60.4, 70], [100, 50, 180, 120]], [1.5, 0.25], [0.82, 0.564]),
-        Detections.empty(),
+        ImageDetections([[10, 20, 60.4, 70], [100, 50, 180, 120]], [1.5, 0.25], [0.82, 0.564]),
+        ImageDetections(np.empty((0, 4)), np.empty(0)),
     ]
     answers = iter(found)
     monkeypatch.setattr(detector.Detector, "detect", lambda self, image: next(answers))
     other, folder, boxes = tmp_path / "other.jpg", tmp_path / "new" / "out", tmp_path / "boxes.csv"
     write_image(other, read_image(picture))
-    out = succeed("detect", picture, other, "-o", folder, "--boxes", boxes)
+    out = succeed("detect", picture, other, "-o", folder, "--boxes", boxes, "--jobs", 1)
     assert out.splitlines() == [
         f"{picture}: 2 vehicles  [10 20 60 70] 82%  [100 50 180 120] 56%",
         f"{other}: 0 vehicles",
@@ -98,11 +101,36 @@ def test_folders_are_searched_and_distances_stated_with_a_lens(picture, tmp_path
     for name in ("a/1.png", "b/1.png"):
         (tmp_path / "in" / name).parent.mkdir(parents=True, exist_ok=True)
         write_image(tmp_path / "in" / name, road((14, 0), (34, 3.6), shape=(360, 640), random_state=3).image)
-    words = "--fov", 58, "--horizon", 0.5, "-o", tmp_path / "out", "--boxes", tmp_path / "boxes.csv"
+    words = "--fov", 58, "-o", tmp_path / "out", "--boxes", tmp_path / "boxes.csv"
     out = succeed("detect", tmp_path / "in", *words)
-    assert len(re.findall(r"\d% \d+ ± \d+ m", out)) >= 2
+    assert len(re.findall(r"\d% \d+ ± \d+ m", out)) == 4
     assert contents(tmp_path / "out") == ["a", "a/1.png", "b", "b/1.png"]
-    assert "b/1.png" in (tmp_path / "boxes.csv").read_text()
+    table = read_labels(tmp_path / "boxes.csv")
+    assert table.frame_keys == ("a/1.png", "b/1.png")
+    assert (np.abs(table["distance_m"] - [14, 34] * 2) < 2 * table["distance_std_m"]).all()
+
+
+def test_images_are_searched_in_parallel_and_listed_in_order(tmp_path, monkeypatch):
+    def detect(self, image):
+        time.sleep(0.05 * (image[0, 0, 0] == 0))  # the first one takes longest
+        threads.add(threading.get_ident())
+        return ImageDetections([[0, 0, 9 + image[0, 0, 0], 9]], [1.0])
+
+    threads = set()
+    (tmp_path / "in").mkdir()
+    monkeypatch.setattr(detector.Detector, "detect", detect)
+    for number in range(6):
+        write_image(tmp_path / "in" / f"{number}.png", np.full((96, 128, 3), number, np.uint8))
+    out = succeed("detect", tmp_path / "in", "--jobs", 3)
+    assert re.findall(r"0 0 (\d+) 9", out) == [str(9 + number) for number in range(6)]
+    assert 1 < len(threads) <= 3
+
+
+def test_a_vehicle_without_a_distance_is_mentioned(tmp_path):
+    write_image(tmp_path / "1.png", road((4.0, 1.8), (14, 0), shape=(360, 640), random_state=3).image)
+    result = run("detect", tmp_path / "1.png", "--fov", 58)
+    unknown = sum("±" not in text for text in result.stdout.split("%")[1:])
+    assert (f"no distance for {unknown} vehicle" in result.stderr) == (unknown > 0)
 
 
 def test_a_damaged_but_readable_image_gives_a_warning(picture, tmp_path):

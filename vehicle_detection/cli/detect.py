@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -74,6 +75,9 @@ class DetectOptions:
     model: str = shared.MODEL
     classes: str | None = shared.CLASSES
     device: str = shared.DEVICE
+    jobs: int | None = shared.search_option(
+        None, "N", "Images searched in parallel, such as 2; default: one per core."
+    )
     conf: float | None = shared.CONFIDENCE
     camera: str | None = shared.CAMERA
     fov: float | None = _FOV
@@ -90,7 +94,7 @@ def detect(options: DetectOptions) -> None:
 
     Exit code 3: some images cannot be decoded, and are left out.
     """
-    from vehicle_detection._common import encodable
+    from vehicle_detection._common import encodable, resolve_jobs
 
     with option_names(image="IMAGE", path="IMAGE"):
         images = list(dict.fromkeys(itertools.chain.from_iterable(map(_expand, options.images))))
@@ -100,13 +104,17 @@ def detect(options: DetectOptions) -> None:
     camera = vd.open_camera(
         options.camera, fov=options.fov, height_m=options.camera_height, horizon=options.horizon
     )
+    jobs = resolve_jobs(options.jobs)
     with (
-        vd.Detector(loaded, conf=options.conf, camera=camera) as detector,
+        # Several images are searched in parallel by one thread each, which takes the least time.
+        vd.Detector(
+            loaded, conf=options.conf, camera=camera, jobs=1 if len(images) > 1 else jobs
+        ) as detector,
         output_folder(options.output, "--output"),
         output_folder(options.why, "--why"),
     ):
         announce_replaced([options.boxes])
-        found = _detect_each(images, detector, options, left_out)
+        found = _detect_each(images, detector, options, min(jobs, len(images)), left_out)
         if options.horizon is not None:
             readable = (image for image in images if image not in left_out)
             found = _warn_if_empty(found, readable, detector, options.horizon)
@@ -177,7 +185,7 @@ def _check(options: DetectOptions, images: list[_Image]) -> None:
 
 
 def _detect_each(
-    images: list[_Image], detector: vd.Detector, options: DetectOptions, left_out: list[_Image]
+    images: list[_Image], detector: vd.Detector, options: DetectOptions, jobs: int, left_out: list[_Image]
 ) -> Iterator[tuple[str, vd.Detections]]:
     """Detect the vehicles of each image, print them, and write what the options name.
 
@@ -185,20 +193,23 @@ def _detect_each(
     if all of them are.
     """
     import cv2
+    import numpy as np
 
     from vehicle_detection._common import pluralize
     from vehicle_detection.drawing import draw_texts, line_width_for
 
-    searched, too_small = False, list[str]()
-    for image, pixels in _read_each(images, left_out):
+    searched, too_small, without_distance = 0, list[str](), 0
+    for image, pixels, result in _search_each(_read_each(images, left_out), detector, jobs):
         try:
-            found = detector.detect(pixels)
+            found = result()
         except InvalidInputError as error:
             left_out.append(image)
             too_small.append(f"{image}: {error}")
             continue
-        searched = True
-        texts = _texts(found, detector.camera)
+        searched += 1
+        texts = _texts(found)
+        if found.distances_m is not None:
+            without_distance += int(np.isnan(found.distances_m).sum())
         listed = "".join(
             f"  [{' '.join(f'{side:.0f}' for side in box)}] {text}"
             for box, text in zip(found.boxes.tolist(), texts)
@@ -218,27 +229,46 @@ def _detect_each(
             target = options.output / name.with_name(name.stem + suffix)
             target.parent.mkdir(parents=True, exist_ok=True)
             vd.write_image(target, drawn)
-        yield image.name, found
+        yield image.name, found.with_columns(source=None)  # without the pixels
     if too_small and not searched:
         raise InvalidInputError(too_small[0])
+    if without_distance:
+        remedy = "" if options.horizon is not None else " without a stated --horizon"
+        print_error(
+            f"note: no distance for {pluralize(without_distance, 'vehicle')}: cut off by the frame, or seen "
+            f"from the side{remedy}"
+        )
     for reason in too_small:
         print_error(f"warning: {reason}; left out")
 
 
-def _texts(found: Any, camera: vd.Camera) -> list[str]:
+def _texts(found: Any) -> list[str]:
     """Return the confidence of each box and, if the lens is known, its distance."""
     from vehicle_detection._common import UNITS
     from vehicle_detection.drawing import score_texts
 
     texts = score_texts(found)
-    if not camera.lens_is_known or not len(found):
+    if found.distances_m is None:
         return texts
-    distances = found.distances(camera).T.tolist()
+    distances = zip(found.distances_m.tolist(), found.distance_stds_m.tolist())
     metric = UNITS["metric"]
     return [
         text if distance != distance else f"{text} {metric.distance_text(distance, std, with_std=True)}"
         for text, (distance, std) in zip(texts, distances)
     ]
+
+
+def _search_each(
+    images: Iterator[tuple[_Image, Any]], detector: vd.Detector, jobs: int
+) -> Iterator[tuple[_Image, Any, Callable[[], Any]]]:
+    """Search images in `jobs` threads; yield each with its pixels and a function that returns the result."""
+    pending = deque[tuple[_Image, Any, Callable[[], Any]]]()
+    with ThreadPoolExecutor(jobs, thread_name_prefix="vehicle-detect") as pool:
+        for image, pixels in images:
+            pending.append((image, pixels, pool.submit(detector.detect, pixels).result))
+            if len(pending) > jobs:
+                yield pending.popleft()
+        yield from pending
 
 
 def _read_each(images: list[_Image], left_out: list[_Image]) -> Iterator[tuple[_Image, Any]]:

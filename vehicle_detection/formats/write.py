@@ -45,7 +45,7 @@ from vehicle_detection.tracking import TRACK_VALUES, UNKNOWN_LABEL, is_result, s
 TIME_COLUMN = "time_s"
 DIGITS = dict(zip((*TRACK_COLUMNS[2:-1], TIME_COLUMN), (2, 2, 2, 2, 4, 2, 2, 4, 2, 2, 3)))
 """Decimals of each column of a table of tracks."""
-STILL_COLUMNS = (*BOX_COLUMNS, "confidence", "label")
+_STILL_COLUMNS = (*BOX_COLUMNS, "distance_m", "confidence", "distance_std_m", "label")
 
 _TRACK_FORMATS = (*dict.fromkeys(FORMATS.values()), "yolo")
 _STILL_FORMATS = ("csv", "jsonl", "parquet", "coco", "yolo")
@@ -397,8 +397,9 @@ def write_tracks(
     ``frame`` counts from 0, the first processed frame; boxes are half-open pixels with two decimals.
     Unknown values are empty in CSV and null elsewhere. The score is the log-odds above the threshold, the
     confidence a calibrated probability; speeds are relative to the camera. The label is the class, also
-    of boxes in COCO, YOLO and CVAT, ``vehicle`` if the model does not tell kinds apart. Detections of images
-    have the columns up to ``score``, ``confidence`` and ``label``. The archive for CVAT has no scores.
+    of boxes in COCO, YOLO and CVAT, ``vehicle`` if the model does not tell kinds apart. Images have the
+    columns up to ``score``, ``confidence``, ``label`` and, if known, distances. The archive for CVAT has no
+    scores.
 
     Examples
     --------
@@ -420,7 +421,9 @@ def write_tracks(
         return stream.rows
     named = any(isinstance(key, str) for key in results.frame_keys)
     kind = _check_format(path, format, _STILL_FORMATS if named else _TRACK_FORMATS)
-    columns = STILL_COLUMNS if named else TRACK_COLUMNS
+    columns = tuple(name for name in TRACK_COLUMNS if not named or name in _STILL_COLUMNS)
+    if named and "distance_m" not in results.columns:
+        columns = tuple(name for name in columns if not name.startswith("distance"))
     records = [_round(record) for record in _table_records(results, columns)]
     for record in records if named else ():
         record["track_id"] = None if record["track_id"] == NO_TRACK else record["track_id"]
