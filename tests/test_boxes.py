@@ -289,7 +289,7 @@ def test_classes_follow_their_boxes():
 
 def test_the_remedy_without_supervision(monkeypatch):
     monkeypatch.setitem(sys.modules, "supervision", None)
-    with pytest.raises(InvalidInputError, match="which is not installed; run pip install supervision"):
+    with pytest.raises(InvalidInputError, match="needs supervision; pip install supervision"):
         Detections(TWO, [1, 2]).to_supervision()
 
 

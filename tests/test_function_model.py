@@ -111,7 +111,7 @@ def test_boxes_of_other_classes_are_dropped(class_ids):
 @pytest.mark.parametrize(
     ("result", "message"),
     [
-        (None, r"expected \(boxes, scores\) or \(boxes, scores, classes\), got None; for an image without"),
+        (None, r"it must be \(boxes, scores\) or \(boxes, scores, classes\), got None; for an image without"),
         (([BOX], [0.9, 0.8]), "scores must be one number for each of the 1 boxes"),
         (([BOX], [np.nan]), "scores must be finite"),
         (([[0, 0, np.nan, 4]], [0.5]), "boxes must be finite"),

@@ -347,13 +347,13 @@ def test_invalid_tensors(tmp_path, tensors, message):
     [
         ({"format": "other"}, "is a safetensors file, but not a model of this library"),
         ({"format_version": "99"}, f"has format version 99, this release reads {FORMAT_VERSION}; train"),
-        ({"sha256": "0" * 64}, r"was changed after it was written \(checksum differs\)"),
+        ({"sha256": "0" * 64}, r"was changed after writing \(checksum differs\)"),
         ({"params": '{"orient": 0}'}, "does not fit its own parameters: orient must be an integer"),
         ({"params": '{"color": 1}'}, "does not fit its own parameters"),
         ({"params": "{"}, r"has no readable parameters \(.*\); download it again"),
         ({"params": None}, r"has no readable parameters \('params'\)"),
         ({"metadata": None}, r"has no readable parameters \('metadata'\)"),
-        ({"kind": "other"}, "contains a model of kind 'other', not 'patches'; train one"),
+        ({"kind": "other"}, "is a model of kind 'other', not 'patches'; train one"),
         ({"params": '{"spatial_size": 16}'}, "does not fit its own parameters: templates must have 6156"),
     ],
 )

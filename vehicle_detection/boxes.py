@@ -86,10 +86,8 @@ class Detections:
             unknown = given.size and given.dtype.kind == "f" and np.isnan(given).all()
             confidences = None if unknown else _score_column(given, "confidences", len(boxes))
         if confidences is not None and not ((confidences >= 0) & (confidences <= 1)).all():
-            raise InvalidInputError(
-                f"confidences must be probabilities, 0 to 1, got {describe(self.confidences)}; omit them "
-                "where they are unknown"
-            )
+            remedy = "omit them where they are unknown"
+            raise invalid("confidences", "be probabilities, 0 to 1", self.confidences, remedy)
         vars(self).update(boxes=boxes, scores=scores, confidences=confidences)
         if self.labels is not None:
             labels = check.sequence(self.labels, "labels", "names of the classes of boxes")
@@ -187,10 +185,7 @@ class Detections:
         try:
             from supervision import Detections as SupervisionDetections
         except ImportError as error:
-            raise InvalidInputError(
-                "to_supervision needs the package supervision, which is not installed; run "
-                "pip install supervision"
-            ) from error
+            raise InvalidInputError("to_supervision needs supervision; pip install supervision") from error
         ids = None if tracker_id is None else np.asarray(tracker_id, np.int64).reshape(-1)
         known, labels, classes = self.confidences, self.labels, self.class_ids
         confidences = LOG_ODDS.probability(self.scores) if known is None else known

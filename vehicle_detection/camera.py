@@ -187,10 +187,8 @@ class Camera(Checked):
         derived = {"focal_px": "fov", "horizon_px": "horizon"}
         unknown = sorted(known.keys() - cls.__dataclass_fields__.keys() | known.keys() & derived.keys())
         if unknown:
-            raise InvalidInputError(
-                f"{unknown[0]} is not an argument of Camera.for_frame; "
-                f"pass {derived.get(unknown[0], 'an attribute of Camera')}, or build Camera(...)"
-            )
+            remedy = f"pass {derived.get(unknown[0], 'an attribute of Camera')}, or build Camera(...)"
+            raise InvalidInputError(f"{unknown[0]} is not an argument of Camera.for_frame; {remedy}")
         half = math.radians(angle) / 2
         k1, k2 = (check.number(known.get(name, 0.0), name, low=-1, high=1) for name in ("k1", "k2"))
         radius = float(_fisheye_radius(np.array(half), k1, k2)) if known.get("fisheye") else math.tan(half)

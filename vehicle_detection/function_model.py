@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Checked, check, describe, invalid, number
+from vehicle_detection._common import Checked, check, invalid, number
 from vehicle_detection.boxes import (
     Detections,
     Platt,
@@ -70,9 +70,8 @@ class FunctionModel:
 
     def __post_init__(self) -> None:
         if not callable(self.function):
-            raise invalid(
-                "function", "be a function of an image", self.function, "it returns boxes and scores"
-            )
+            remedy = "it returns boxes and scores"
+            raise invalid("function", "be a function of an image", self.function, remedy)
         vars(self)["thread_safe"] = check.boolean(self.thread_safe, "thread_safe")
         check.instance(self.name, "name", str | None, "omit it for the function's name")
         lock = self._lock
@@ -164,10 +163,8 @@ class FunctionModel:
             if self.class_ids is not None:
                 found = select_classes(found, self.class_ids)
         else:
-            raise InvalidInputError(
-                f"expected (boxes, scores) or (boxes, scores, classes), got {describe(returned)}; for an "
-                "image without vehicles return ([], [])"
-            )
+            remedy = "for an image without vehicles return ([], [])"
+            raise invalid("it", "be (boxes, scores) or (boxes, scores, classes)", returned, remedy)
         boxes = found.boxes
         if boxes.size and boxes.min() >= 0 and boxes.max() <= 1 and (box_areas(boxes) > 0).any():
             raise InvalidInputError(

@@ -108,9 +108,7 @@ def _check_heat(heatmap: object, *, in_place: bool = False) -> NDArray[Any]:
     if array.ndim != 2 or not array.size or array.dtype.kind not in "iuf":
         raise invalid("heatmap", "be an (H, W) number array", heatmap, f"{_START_WITH_ZEROS}")
     if in_place and not array.flags.writeable:
-        raise InvalidInputError(
-            "heatmap must be writable, because it is changed in place; got a read-only array, pass a copy"
-        )
+        raise InvalidInputError("heatmap must be writable, because it is changed in place; pass a copy")
     return array
 
 

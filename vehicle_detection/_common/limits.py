@@ -86,12 +86,8 @@ def _too_large(name: str, limit: Limit) -> str:
 def check_environment() -> None:
     """Raise if numba would fail, or run the kernels, which need its compiler, as Python."""
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
-        raise InvalidInputError(
-            "NUMBA_DISABLE_JIT must be unset or 0, because the kernels need numba's compiler; "
-            f"got {os.environ['NUMBA_DISABLE_JIT']!r}"
-        )
+        value = os.environ["NUMBA_DISABLE_JIT"]
+        raise InvalidInputError(f"NUMBA_DISABLE_JIT must be unset or 0, or kernels fail; got {value!r}")
     threads = os.environ.get("NUMBA_NUM_THREADS", "")
     if threads and not (threads.isdecimal() and int(threads[:9]) >= 1):
-        raise InvalidInputError(
-            f"NUMBA_NUM_THREADS must be unset or a number of threads, at least 1; got {threads!r}"
-        )
+        raise InvalidInputError(f"NUMBA_NUM_THREADS must be unset or at least 1; got {threads!r}")

@@ -88,9 +88,7 @@ def read_model(path: str | os.PathLike[str], kind: str) -> ModelData:
     if not isinstance(path, (str, os.PathLike)):
         raise check.invalid("path", f"be a model file or one of {', '.join(map(repr, SHIPPED))}", path)
     if str(path) == "default":
-        raise ModelFileError(
-            "the shipped model 'default' is a network, no classifier of patches; load it with load_model"
-        )
+        raise ModelFileError("the model 'default' is no classifier of patches; load it with load_model")
     if str(path) in SHIPPED:
         resource = resources.files("vehicle_detection") / "models" / f"{path}.safetensors"
         if not resource.is_file():
@@ -143,13 +141,9 @@ def _parse(data: bytes, name: str, kind: str) -> ModelData:
             f"{FORMAT_VERSION}; train again or install the release that wrote it"
         )
     if header.get("sha256") != checksum(header, tensors):
-        raise ModelFileError(
-            f"{name} was changed after it was written (checksum differs); restore it from a copy"
-        )
+        raise ModelFileError(f"{name} was changed after writing (checksum differs); restore a copy of it")
     if header.get("kind") != kind:
-        raise ModelFileError(
-            f"{name} contains a model of kind {header.get('kind')!r}, not {kind!r}; train one"
-        )
+        raise ModelFileError(f"{name} is a model of kind {header.get('kind')!r}, not {kind!r}; train one")
     _check_tensors(tensors, name)
     try:
         params, metadata = json.loads(header["params"]), json.loads(header["metadata"])

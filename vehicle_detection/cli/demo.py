@@ -108,9 +108,7 @@ def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False)
         # moviepy, because `process_video` needs a source. It looks for ffmpeg when it is imported.
         from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
     except RuntimeError:
-        raise VideoError(
-            "no ffmpeg program was found; install ffmpeg, or set FFMPEG_BINARY to its path"
-        ) from None
+        raise VideoError("no ffmpeg was found; install it, or set FFMPEG_BINARY to its path") from None
     try:
         with (
             FFMPEG_VideoWriter(str(clip), (width, height), drive.fps, preset="veryfast") as writer,

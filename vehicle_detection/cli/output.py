@@ -246,14 +246,12 @@ def output_folder(folder: Path | None, option: str) -> Iterator[None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InvalidInputError(
-            f"{option} must be a folder, {folder} cannot be created: {error.strerror}; choose another"
-        ) from error
+        problem = f"{folder} cannot be created: {error.strerror}"
+        raise InvalidInputError(f"{option} must be a folder, {problem}; choose another") from error
     try:
         if not os.access(folder, os.W_OK | os.X_OK):
-            raise InvalidInputError(
-                f"{option} needs a writable folder, {folder} is read-only; choose another"
-            )
+            problem = f"{folder} is read-only; choose another"
+            raise InvalidInputError(f"{option} needs a writable folder, {problem}")
         yield
     except BaseException:
         with contextlib.suppress(OSError):

@@ -21,7 +21,6 @@ import numpy as np
 from vehicle_detection._common import (
     available_cores,
     check,
-    describe,
     hide_credentials,
     import_pyarrow,
     invalid,
@@ -257,10 +256,7 @@ def _parse_shard(shard: object) -> tuple[int, int]:
 def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -> dict[str, Any]:
     """Parameters that the results depend on, as plain values."""
     if not isinstance(model, (str, os.PathLike)):
-        raise InvalidInputError(
-            f"model must be a name or the path of a file that workers can load, got {describe(model)}; save "
-            "the model to a file"
-        )
+        raise invalid("model", "be a name or the path of a file", model, "save the model to a file")
     name = os.fspath(model)
     if not shipped_model(name).is_file() and Path(name).exists():
         name = os.path.abspath(name)

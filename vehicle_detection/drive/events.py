@@ -11,11 +11,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import UNITS, Floats, Units, check, describe
+from vehicle_detection._common import UNITS, Floats, Units, check, invalid
 from vehicle_detection.camera import Camera
 from vehicle_detection.drive.history import TrackHistory, split_runs, track_histories
 from vehicle_detection.drive.motion import LANE_HALF_WIDTH_M, Bools, Motion, estimate_motion
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tables import TrackTable
 
 Kind = Literal[
@@ -252,10 +251,8 @@ def _check_speed(speed: float | ArrayLike | None, length: int) -> Floats:
     array = check.array(speed, "own_speed_mps")
     shaped = array.ndim == 0 or (array.ndim == 1 and len(array) >= length)
     if not shaped or array.dtype.kind not in "iuf" or np.isinf(array).any() or (array < 0).any():
-        raise InvalidInputError(
-            "own_speed_mps must be a number of at least 0, or one for each frame, "
-            f"got {describe(speed)}; pass meters per second"
-        )
+        expected = "be a number of at least 0, or one for each frame"
+        raise invalid("own_speed_mps", expected, speed, "pass meters per second")
     return np.asarray(np.broadcast_to(array, length) if array.ndim == 0 else array, np.float64)
 
 

@@ -79,16 +79,13 @@ class OwnSpeed:
                 raise InvalidInputError(f"{name} must be finite, got NaN or infinity; drop these values")
             object.__setattr__(self, name, values.astype(np.float64))
         if len(self.seconds) != len(self.speeds_mps):
-            raise InvalidInputError(
-                f"speeds_mps must have one value for each of the {len(self.seconds)} seconds, "
-                f"got {len(self.speeds_mps)}"
-            )
+            expected = f"have one value for each of the {len(self.seconds)} seconds"
+            raise invalid("speeds_mps", expected, len(self.speeds_mps))
         if (np.diff(self.seconds) <= 0).any():
             raise InvalidInputError("seconds must ascend; sort them and drop repeated ones")
         if (self.speeds_mps < 0).any():
-            raise InvalidInputError(
-                f"speeds_mps must be at least 0, got {self.speeds_mps.min():g}; pass speeds, not velocities"
-            )
+            lowest = float(self.speeds_mps.min())
+            raise invalid("speeds_mps", "be at least 0", lowest, "pass speeds, not velocities")
         store_number(self, "max_gap", above=0)
         clock = check.array(self.clock, "clock")
         pairs = clock.ndim == 2 and clock.shape[1] == 2 and clock.dtype.kind in "iuf"
@@ -160,9 +157,7 @@ def read_own_speed(path: str | os.PathLike[str], *, offset: float = 0.0) -> OwnS
     readers = {".gpx": _read_gpx, ".nmea": _read_nmea, ".csv": _read_csv}
     reader = readers.get(file.suffix.lower())
     if reader is None:
-        raise InvalidInputError(
-            f"path must end in {' or '.join(readers)}, got {file.name!r}; convert the record"
-        )
+        raise invalid("path", f"end in {' or '.join(readers)}", file.name, "convert the record")
     points = reader(read_regular_file(file, f"path {file}", Limit.RECORD_BYTES), str(file))
     if reader is not _read_csv:
         points = _from_first_point(points, str(file))

@@ -165,9 +165,7 @@ def open_dask(address: str, jobs: int | None = None) -> Iterator[tuple[Executor,
         import dask
         import distributed
     except ImportError:
-        raise InvalidInputError(
-            "dask needs dask[distributed]; pip install 'dask[distributed]', or omit it"
-        ) from None
+        raise InvalidInputError("dask needs a package; pip install 'dask[distributed]'") from None
     scheduler = "distributed.scheduler"
     options = {f"{scheduler}.allowed-failures": _ALLOWED_FAILURES, f"{scheduler}.worker-saturation": 1.0}
     with contextlib.ExitStack() as stack:
