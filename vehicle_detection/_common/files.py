@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import glob
 import logging
 import os
 import shutil
@@ -209,48 +210,13 @@ def private_folder(name: str) -> str:
 @contextlib.contextmanager
 def temporary_folder(parent: Path, name: str) -> Iterator[Path]:
     """Create a hidden folder in `parent`, removed after the block; also remove those of killed processes."""
-    prefix, suffix = f".{name}.", ".part"
     with contextlib.ExitStack() as stack:
-        if sys.platform != "win32":
-            for old in parent.iterdir():
-                if old.name.startswith(prefix) and old.name.endswith(suffix) and old.is_dir():
-                    _remove_abandoned(old)
-        locked = False
-        while not locked:
-            with _output_errors(parent / name, every=True):
-                folder = Path(tempfile.mkdtemp(prefix=prefix, suffix=suffix, dir=parent))
+        with _output_errors(parent / name, every=True):
+            lock = _open_part(parent / name, stack)
+            stack.callback(lock.unlink, missing_ok=True)
+            for left in parent.glob(f"{glob.escape(lock.name)}.*"):  # no process has locked them
+                shutil.rmtree(left, ignore_errors=True)
+            folder = Path(tempfile.mkdtemp(prefix=f"{lock.name}.", dir=parent))
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
-            locked = sys.platform == "win32" or _keep_locked(folder, stack)
         with _output_errors(parent / name):
             yield folder
-
-
-def _keep_locked(folder: Path, stack: contextlib.ExitStack) -> bool:
-    """Lock a new folder; False if another process has removed it before, as an abandoned one."""
-    try:
-        stack.callback(os.close, _lock_folder(folder))
-    except (BlockingIOError, FileNotFoundError):  # the other process is about to remove it, or has
-        return False
-    except OSError:  # a file system without locks
-        return True
-    return folder.exists()
-
-
-def _lock_folder(folder: Path) -> int:
-    """Open and lock a folder; OSError if another process has locked it."""
-    import fcntl
-
-    handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(handle)
-        raise
-    return handle
-
-
-def _remove_abandoned(folder: Path) -> None:
-    with contextlib.suppress(OSError):  # in use
-        handle = _lock_folder(folder)
-        shutil.rmtree(folder, ignore_errors=True)
-        os.close(handle)
