@@ -152,19 +152,15 @@ def open_locked(part: Path) -> int | None:
     """
     import fcntl
 
-    flags = os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
     while True:
-        created = False
         try:
-            handle = os.open(part, flags | os.O_CREAT | os.O_EXCL, 0o600)
-            created = True
-        except FileExistsError:
-            try:
-                handle = os.open(part, flags)
-            except FileNotFoundError:  # renamed or removed in between
-                continue
-            except OSError as error:  # a link, a folder, or the file of another user
-                raise BlockingIOError(error.errno, error.strerror) from error
+            handle = os.open(part, flags, 0o600)
+        except OSError as error:
+            if not os.path.lexists(part):  # the disk is full, or read-only
+                raise
+            # A link, a folder, or the file of another user.
+            raise BlockingIOError(error.errno, error.strerror) from error
         try:
             status = os.fstat(handle)
             if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:  # a pipe, or also another's file
@@ -172,16 +168,15 @@ def open_locked(part: Path) -> int | None:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             with contextlib.suppress(FileNotFoundError):
                 # Another process may have renamed or removed the file before it was locked.
-                if os.path.samestat(os.stat(part), os.fstat(handle)):
+                if os.path.samestat(os.stat(part), status):
                     os.truncate(handle, 0)
                     return handle
         except BlockingIOError:
             os.close(handle)
             raise
-        except OSError:
+        except OSError:  # a file system without locks
             os.close(handle)
-            if created:
-                part.unlink()
+            part.unlink()
             return None
         os.close(handle)
 
