@@ -124,14 +124,6 @@ def test_a_fisheye_sees_its_fov():
         assert degrees == pytest.approx(min(angle, 160), abs=0.1)
 
 
-def test_boxes_of_small_integers_are_rectified():
-    camera = Camera.for_frame(SHAPE, lens="fisheye-120")
-    boxes = [[100, 100, 200, 200]]
-    expected = camera.rectify_boxes(np.array(boxes, np.float64), SHAPE)
-    np.testing.assert_array_equal(camera.rectify_boxes(np.array(boxes, np.uint8), SHAPE), expected)
-    np.testing.assert_array_equal(camera.rectify_boxes(boxes, SHAPE), expected)
-
-
 def test_a_pinhole_camera_keeps_boxes_and_horizon():
     boxes = np.array([[600.0, 300, 700, 420]])
     assert CAMERA.rectify_boxes(boxes, SHAPE) is boxes

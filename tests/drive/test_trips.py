@@ -146,7 +146,6 @@ MAKERS = {
     "{0:%Y%m%d_%H%M%S}_EI.mp4": "interior",
     "{0:%Y%m%d_%H%M%S}_NR.mp4": "rear",
     "{0:%Y%m%d_%H%M%S}_NFS.mp4": "front",
-    "GH{1:02}0042.MP4": "unknown",  # GoPro
     "{0:%Y_%m%d_%H%M%S}_{1:06}F.MP4": "front",  # Viofo
     "{0:%Y_%m%d_%H%M%S}_{1:06}PI.MP4": "interior",
     "NO{0:%Y%m%d-%H%M%S}-{1:06}B.MP4": "rear",  # 70mai
@@ -160,35 +159,7 @@ MAKERS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("starts", "trips"),
-    [
-        ((0, 60, 120, 180), [4]),
-        ((0, 61, 121, 183), [4]),  # the clock's seconds, and a short pause between two files
-        ((0, 60, 600, 660), [2, 2]),
-        ((0, 600, 1200, 1800), [1, 1, 1, 1]),
-        ((0, 60, 120, "broken"), [4]),  # the camera lost power: the last one has no length
-    ],
-)
 @pytest.mark.parametrize("form", MAKERS)
-def test_trips_of_the_common_makers(tmp_path, form, starts, trips):
-    lengths = {}
-    for number, start in enumerate(starts, 1):
-        begin = datetime(2026, 1, 31, 8) + timedelta(seconds=180 if start == "broken" else start)
-        file = tmp_path / form.format(begin, number)
-        file.touch()
-        lengths[file] = 0.0 if start == "broken" else 60.0
-        end = begin.timestamp() + (lengths[file] or 20)
-        os.utime(file, (end, end))
-    found = find_trips(reversed(lengths), duration=lengths.__getitem__)
-    if form.startswith("GH"):  # the chapters of a recording have no gaps
-        trips = [4]
-    assert [len(trip.files) for trip in found] == trips
-    assert {trip.camera for trip in found} == {MAKERS[form]}
-    assert [file for trip in found for file in trip.files] == list(lengths)
-
-
-@pytest.mark.parametrize("form", [form for form in MAKERS if not form.startswith("GH")])
 def test_generated_trips_of_the_common_makers(tmp_path, form):
     """Files of any length with pauses of up to 2 s, gaps, overlaps and a last file that cannot be read."""
     rng = np.random.default_rng(len(form))
@@ -220,6 +191,7 @@ def test_generated_trips_of_the_common_makers(tmp_path, form):
             rng.permutation(np.array(list(lengths), object)).tolist(), duration=lengths.__getitem__
         )
         assert [list(trip.files) for trip in found] == expected
+        assert {trip.camera for trip in found} == {MAKERS[form]}
 
 
 def test_cameras_kinds_of_recording_and_copies_in_low_resolution_are_told_apart():
