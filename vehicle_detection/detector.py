@@ -229,6 +229,13 @@ class Detector(Closing):
         """Search an ``(H, W, 3)`` uint8 RGB image, not too small for a window, for windows and vehicles."""
         return self._search.find(frame, self.search_params, min_vehicle_score=self.low_score)
 
+    def reduction(self, shape: tuple[int, ...]) -> int:
+        """Whole factor by which the search reduces frames of this shape first.
+
+        For a frame that was reduced before, ``search(frame).enlarged(factor)`` is the same result.
+        """
+        return self._search.reduction(shape, self.search_params)
+
     def fit(self, found: SearchResult) -> Detections:
         """Return the vehicles of a search with confidences, including scores below 0."""
         check.instance(found, "found", SearchResult, "pass what search returns")
@@ -463,6 +470,10 @@ class VehicleDetector(Closing):
     def search(self, frame: Image) -> SearchResult:
         """Search a frame, as `Detector.search`; needs no other frame, and is thread-safe."""
         return self.detector.search(frame)
+
+    def reduction(self, shape: tuple[int, ...]) -> int:
+        """Whole factor by which the search reduces frames of this shape first, as `Detector.reduction`."""
+        return self.detector.reduction(shape)
 
     @overload
     def detect(self, image: Image | bytes, *, conf: float | None = None) -> ImageDetections: ...

@@ -24,7 +24,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import cv2
 import numpy as np
@@ -278,6 +278,15 @@ class SearchResult:
     shape: tuple[int, int]
     seconds: float
 
+    def enlarged(self, factor: int) -> Self:
+        """Return the result for a frame that was reduced by a whole factor before the search."""
+        windows, vehicles = (
+            found if found is None else found.with_columns(boxes=found.boxes * factor)
+            for found in (self.windows, self.vehicles)
+        )
+        shape = self.shape[0] * factor, self.shape[1] * factor
+        return dataclasses.replace(self, windows=windows, vehicles=vehicles, shape=shape)
+
     def __repr__(self) -> str:
         return f"SearchResult(windows={self.windows}, vehicles={self.vehicles}, shape={self.shape})"
 
@@ -311,6 +320,10 @@ class FrameSearch(Closing, ABC):
         min_score = check.number(min_vehicle_score, "min_vehicle_score")
         windows, vehicles = self._search(frame, params, min_score)
         return SearchResult(windows, vehicles, (height, width), time.perf_counter() - start)
+
+    def reduction(self, shape: tuple[int, ...], params: Any) -> int:
+        """Whole factor by which the search reduces frames of this shape first."""
+        return 1
 
     @abstractmethod
     def _search(

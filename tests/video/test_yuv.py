@@ -1,11 +1,18 @@
 """Conversion of frames to planes and back."""
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_detection.video.yuv import ColorEncoding, planes_from_rgb, rgb_from_planes
+from vehicle_detection.video.yuv import (
+    ColorEncoding,
+    DecodedFrame,
+    PlanarFrame,
+    planes_from_rgb,
+    rgb_from_planes,
+)
 
 VALUES = st.integers(0, 255)
 SIZES = st.integers(1, 9)
@@ -72,3 +79,27 @@ def test_thin_lines_keep_their_color():
 def test_an_encoding_knows_whether_it_is_supported():
     assert ColorEncoding("bt709").supported
     assert not ColorEncoding("ycgco").supported
+
+
+def frames_of(seed, space, factor=2, cells=(12, 20)):
+    """A frame of smooth colors as planes and as RGB."""
+    height, width = (2 * factor * side for side in cells)
+    coarse = np.random.default_rng(seed).integers(40, 210, (4, 6, 3), np.uint8)
+    smooth = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    return PlanarFrame(planes_of(smooth), ColorEncoding(space))
+
+
+@pytest.mark.parametrize("space", ["unknown", "bt709"])
+@pytest.mark.parametrize("factor", [2, 3, 4])
+def test_reduced_planes_equal_the_reduced_frame(space, factor):
+    frame = frames_of(1, space, factor)
+    error = np.abs(frame.reduced(factor).astype(int) - DecodedFrame(frame.rgb()).reduced(factor))
+    assert error.max() <= 4
+    assert error.mean() <= 1
+
+
+@pytest.mark.parametrize("space", ["unknown", "bt709"])
+def test_samples_of_planes_are_pixels_of_the_frame(space):
+    frame = frames_of(2, space)
+    expected = DecodedFrame(frame.rgb()).sampled((9, 16))
+    assert np.abs(frame.sampled((9, 16)).astype(int) - expected).max() <= 1

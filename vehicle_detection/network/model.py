@@ -206,6 +206,10 @@ class NetworkSearch(FrameSearch):
         self._lock = threading.Lock()
         _SEARCHES.add(self)
 
+    def reduction(self, shape: tuple[int, ...], params: NetworkParams) -> int:
+        """Whole factor by which the search reduces frames of this shape first."""
+        return self.model.input_format.reduction(shape, self.model.input_size_for(params))
+
     def abandon_session(self) -> None:
         """Open a new session on the next search: a forked child lacks the threads of the last one."""
         if self._session is not None:

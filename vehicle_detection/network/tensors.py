@@ -91,14 +91,20 @@ def _resize(
     OpenCV takes means over whole pixels in a tenth of the time of others.
     """
     height, width = frame.shape[:2]
-    factor = min(height // size[0], width // size[1])
-    if factor > 1 and height % factor == width % factor == 0:
+    factor = _reduction(frame.shape, size)
+    if factor > 1:
         memory = workspace.take((height // factor, width // factor, 3), np.uint8, "reduced")
         cv2.resize(frame, (width // factor, height // factor), dst=memory, interpolation=cv2.INTER_AREA)
         frame = memory
     by_less_than_2 = frame.shape[0] < 2 * size[0] and frame.shape[1] < 2 * size[1]
     method = cv2.INTER_LINEAR if by_less_than_2 else cv2.INTER_AREA
     return cv2.resize(frame, size[::-1], dst=target, interpolation=method)
+
+
+def _reduction(shape: tuple[int, ...], size: Size) -> int:
+    """Whole factor by which a frame of this shape is reduced towards a size, before other factors."""
+    factor = min(shape[0] // size[0], shape[1] // size[1])
+    return factor if factor > 1 and shape[0] % factor == shape[1] % factor == 0 else 1
 
 
 @dataclass(frozen=True)
@@ -131,6 +137,13 @@ class InputFormat:
         factor = min(size[0] / shape[0], size[1] / shape[1])
         height, width = (min(max(round(side * factor), 1), limit) for side, limit in zip(shape[:2], size))
         return (height, width), size
+
+    def reduction(self, shape: tuple[int, ...], input_size: int) -> int:
+        """Whole factor by which `prepare` reduces frames of this shape; reduced ones give the same input."""
+        sizes = self.fit(shape, input_size)
+        factor = _reduction(shape, sizes[0])
+        reduced = shape[0] // factor, shape[1] // factor
+        return factor if self.fit(reduced, input_size) == sizes else 1
 
     def prepare(
         self, frame: NDArray[np.uint8], input_size: int, workspace: Workspace = NEW_ARRAYS

@@ -46,6 +46,13 @@ class SceneCuts:
     def __init__(self) -> None:
         self._last: tuple[Thumbnail, Thumbnail] | None = None  # the last frame's, and its details
 
+    @staticmethod
+    def sample_size(shape: tuple[int, ...]) -> tuple[int, int]:
+        """Height and width to which a frame of this shape may be sampled before, with the same result."""
+        scale = _THUMBNAIL_SIDE / max(shape[:2])
+        height, width = (max(8, round(side * scale)) * _SAMPLES for side in shape[:2])
+        return height, width
+
     def update(self, frame: NDArray[np.uint8]) -> bool:
         """Whether the next ``(H, W, 3)`` frame, of any size, belongs to another scene than the one before."""
         check_image(frame, "frame")
@@ -69,10 +76,9 @@ class SceneCuts:
 
 def _make_thumbnail(frame: NDArray[np.uint8]) -> Thumbnail:
     """Gray values of a frame's thumbnail, with its aspect ratio."""
-    scale = _THUMBNAIL_SIDE / max(frame.shape[:2])
-    height, width = (max(8, round(side * scale)) for side in frame.shape[:2])
-    sampled = cv2.resize(frame, (width * _SAMPLES, height * _SAMPLES), interpolation=cv2.INTER_NEAREST)
-    shrunk = cv2.resize(sampled, (width, height), interpolation=cv2.INTER_AREA)
+    height, width = SceneCuts.sample_size(frame.shape)
+    sampled = cv2.resize(frame, (width, height), interpolation=cv2.INTER_NEAREST)
+    shrunk = cv2.resize(sampled, (width // _SAMPLES, height // _SAMPLES), interpolation=cv2.INTER_AREA)
     return np.asarray(shrunk.mean(axis=2, dtype=np.float32))
 
 

@@ -48,6 +48,7 @@ from vehicle_detection.video.opening import Source, borrow_source
 from vehicle_detection.video.queues import ClosableQueue, QueueClosed
 from vehicle_detection.video.reading import AudioSource, Reader, check_span, frame_range
 from vehicle_detection.video.sources import FrameSource
+from vehicle_detection.video.yuv import DecodedFrame
 
 if TYPE_CHECKING:
     import pandas
@@ -65,8 +66,9 @@ Frame = NDArray[np.uint8]
 class VideoDetector(Protocol):
     """The methods of a detector that `track` calls, such as a `VehicleDetector`.
 
-    It may have two attributes: `searches_every_frame`, whether no frame may be skipped (True if missing), and
-    `track_params`, the `TrackParams` for backfilling (none if missing).
+    It may have more attributes: `searches_every_frame`, whether no frame may be skipped (True if missing);
+    `track_params`, the `TrackParams` for backfilling (none if missing); and `reduction`, a method that
+    returns the whole factor by which frames of a shape are reduced before `search` (1 if missing).
     """
 
     def search(self, frame: Frame, /) -> Any:
@@ -140,7 +142,7 @@ class VideoReport:
 @dataclass
 class _QueuedFrame:
     time: float
-    frame: Frame | None  # None if nobody asked for it
+    frame: DecodedFrame | None  # None if nobody asked for it
     cut: bool  # whether it begins another scene
     search: Future[tuple[Any, float]] | None  # None: the frame is not searched
     dropped: int = 0  # frames that a live source dropped before this one
@@ -174,6 +176,7 @@ class _Plan:
     delay: int
     lookahead: int
     frames: bool  # whether the results hold their frames
+    reduction: int  # factor by which frames are reduced before the search
 
 
 class _Pipeline:
@@ -251,14 +254,17 @@ class _Pipeline:
     def _decode(self, reader: Reader) -> None:
         """Submit the frames to search to the pool, and queue all of them in order."""
         cuts, skipped, expected = SceneCuts(), 0, None
-        for index, moment, frame in reader:
+        sample = SceneCuts.sample_size(self._plan.source.info.shape)
+        for index, moment, frame in reader.decoded():
             if self.stopped:
                 break
-            cut = cuts.update(frame) or index in self._plan.source.breaks
+            cut = cuts.update(frame.sampled(sample)) or index in self._plan.source.breaks
             skipped += 1
             dropped = index - expected if expected is not None else 0
             search = None
             if expected is None or dropped or cut or skipped >= self._plan.interval:
+                if self._plan.reduction == 1:  # once for the search and for drawing
+                    frame = DecodedFrame(frame.rgb())
                 search, skipped = self._pool.submit(self._search, frame), 0
             kept = frame if self._plan.frames else None
             self._queue.put(_QueuedFrame(moment, kept, cut, search, dropped))
@@ -266,9 +272,13 @@ class _Pipeline:
             self.dropped += dropped
             expected = index + 1
 
-    def _search(self, frame: Frame) -> tuple[Any, float]:
-        start = time.perf_counter()
-        return self._detector.search(frame), time.perf_counter() - start
+    def _search(self, frame: DecodedFrame) -> tuple[Any, float]:
+        start, factor = time.perf_counter(), self._plan.reduction
+        if factor == 1:
+            found = self._detector.search(frame.rgb())
+        else:
+            found = self._detector.search(frame.reduced(factor)).enlarged(factor)
+        return found, time.perf_counter() - start
 
     def _track_frames(self) -> Iterator[Any]:
         """Track the searched frames, and yield the results of all frames in their order."""
@@ -316,8 +326,8 @@ class _Pipeline:
             for name, seconds in result.seconds.items():
                 if name != "search":  # measured here, because a detector may omit it
                     self.stages[name] += seconds
-            yield replace(result, frame=item.frame) if self._plan.frames else result
-            item.frame = None
+            frame, item.frame = item.frame, None
+            yield result if frame is None else replace(result, frame=frame.rgb())
 
 
 class TrackRun(Closing):
@@ -506,6 +516,7 @@ def track(
         fps = float(info.fps)
         interval = every or (1 if getattr(found, "searches_every_frame", True) else search_interval(fps))
         params = getattr(found, "track_params", None)
+        reduction = getattr(found, "reduction", lambda shape: 1)(info.shape)
         ahead = min(jobs * interval, _LOOKAHEAD_BYTES // math.prod(info.shape))
         plan = _Plan(
             source=opened,
@@ -517,6 +528,7 @@ def track(
             delay=0 if opened.live or params is None else search_delay(params, fps, interval),
             lookahead=max(jobs, ahead) + 1,
             frames=frames,
+            reduction=reduction,
         )
         return TrackRun(plan, end=end, progress=progress, on_close=stack.pop_all())
 

@@ -53,8 +53,8 @@ def estimate_video_horizon(
         seconds = min(info.frames / fps, math.inf if end is None else end) - (start or 0.0)
         step = max(1, round(fps * min(_INTERVAL, seconds / _MIN_FRAMES)))
         with opened.read(*frame_range(info, start, end)) as frames:
-            for _, _, frame in itertools.islice(frames, 0, step * _MAX_FRAMES, step):
-                boxes.append(detector.detect(frame).boxes)
+            for _, _, frame in itertools.islice(frames.decoded(), 0, step * _MAX_FRAMES, step):
+                boxes.append(detector.detect(frame.rgb()).boxes)
                 if sum(map(len, boxes)) >= _ENOUGH_BOXES:
                     break
     try:

@@ -30,7 +30,7 @@ from vehicle_detection.video.ffmpeg import (
 from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.queues import ClosableQueue, QueueClosed
 from vehicle_detection.video.reading import Reader
-from vehicle_detection.video.yuv import ColorEncoding, rgb_from_planes
+from vehicle_detection.video.yuv import ColorEncoding, DecodedFrame, PlanarFrame
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -164,18 +164,15 @@ class LiveStream(Reader):
             self._thread.start()
         return self
 
-    def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
-        try:
-            number, planes = next(self._frames)
-        except QueueClosed:
-            raise StopIteration from None
-        except StopIteration:
-            if self._killed.is_set() or self._number >= self._first:
-                raise
-            start = float(self._first / self.info.fps)
-            raise VideoError(f"{self.name} has no frame after {start:g} s ({self._reason()})") from None
-        frame = rgb_from_planes(planes, ColorEncoding())
-        return number, float(number / self.info.fps), frame
+    def read_next(self) -> tuple[int, float, DecodedFrame] | None:
+        """Return number, time and content of the next frame; None at the end."""
+        with contextlib.suppress(QueueClosed):
+            for number, planes in self._frames:
+                return number, float(number / self.info.fps), PlanarFrame(planes, ColorEncoding())
+            if not self._killed.is_set() and self._number < self._first:
+                start = float(self._first / self.info.fps)
+                raise VideoError(f"{self.name} has no frame after {start:g} s ({self._reason()})")
+        return None
 
     def _read_range(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Yield the numbers and planes of the chosen frames."""

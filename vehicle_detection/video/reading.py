@@ -10,6 +10,7 @@ import logging
 import math
 import re
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -34,7 +35,7 @@ from vehicle_detection.video.ffmpeg import (
     video_error,
 )
 from vehicle_detection.video.probe import VideoInfo
-from vehicle_detection.video.yuv import FORMATS, rgb_from_planes
+from vehicle_detection.video.yuv import FORMATS, DecodedFrame, PlanarFrame
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -71,6 +72,18 @@ class Reader(Closing):
         return self
 
     def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
+        found = self.read_next()
+        if found is None:
+            raise StopIteration
+        index, moment, frame = found
+        return index, moment, frame.rgb()
+
+    def decoded(self) -> Iterator[tuple[int, float, DecodedFrame]]:
+        """Iterate over the same frames, which are converted to RGB only if and as far as they are used."""
+        return iter(self.read_next, None)
+
+    def read_next(self) -> tuple[int, float, DecodedFrame] | None:
+        """Return number, time and content of the next frame; None at the end."""
         raise NotImplementedError
 
     def kill(self) -> None:
@@ -125,24 +138,24 @@ class FrameReader(Reader):
             options += ["-frames:v", str(count)]
         options += ["-fps_mode", "passthrough"]
         height, width = info.shape[:2]
-        # Planes are read as stored and converted here, which takes half the time of reading RGB.
+        # Planes are read as stored and converted here, in at most half the time of reading RGB.
         even = height % 2 == 0 and width % 2 == 0
         self._in_planes = info.pixel_format in FORMATS and info.color_encoding.supported and even
         pixel_format = info.pixel_format if self._in_planes else "rgb24"
-        self._buffer = np.empty((height * 3 // 2, width) if self._in_planes else info.shape, np.uint8)
+        self._stored_shape = (height * 3 // 2, width) if self._in_planes else info.shape
         options += ["-pix_fmt", pixel_format, "-f", "rawvideo", "pipe:1"]
         self._process = Process(options, stdout=True)
 
-    def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
+    def read_next(self) -> tuple[int, float, DecodedFrame] | None:
+        """Return number, time and content of the next frame; None at the end."""
         if self._process.stdout.closed:
-            raise StopIteration
-        if not self._process.read_into(self._buffer, self._has_data):
+            return None
+        content = np.empty(self._stored_shape, np.uint8)
+        if not self._process.read_into(content, self._has_data):
             self._finish()
-            raise StopIteration
-        if self._in_planes:
-            frame = rgb_from_planes(self._buffer, self.info.color_encoding)
-        else:
-            frame = self._buffer.copy()
+            return None
+        encoding = self.info.color_encoding
+        frame = PlanarFrame(content, encoding) if self._in_planes else DecodedFrame(content)
         index = self._first + self.frames_read
         self.frames_read += 1
         return index, float(index / self.info.fps), frame

@@ -24,6 +24,7 @@ from vehicle_detection.video.files import IMAGE_SUFFIXES
 from vehicle_detection.video.live import LiveStream
 from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.reading import AudioSource, FrameReader, Reader, stream_duration
+from vehicle_detection.video.yuv import DecodedFrame
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -151,15 +152,17 @@ class _ImageReader(Reader):
         chosen = list(enumerate(paths))[first : None if count is None else first + count]
         self._files: Iterator[tuple[int, Path]] = iter(chosen)
 
-    def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
-        index, path = next(self._files)
+    def read_next(self) -> tuple[int, float, DecodedFrame] | None:
+        index, path = next(self._files, (-1, self._first))
+        if index < 0:
+            return None
         frame = read_image(path)
         if frame.shape != self.info.shape:
             raise InvalidInputError(
                 f"source must hold images of one size; {path} is {frame.shape[1]}x{frame.shape[0]} and "
                 f"{self._first} {self.info.width}x{self.info.height}; select the images of one camera"
             )
-        return index, float(index / self.info.fps), frame
+        return index, float(index / self.info.fps), DecodedFrame(frame)
 
     def kill(self) -> None:
         self._files = iter(())
@@ -256,23 +259,23 @@ class _SegmentReader(Reader):
             first -= self._segments.pop(0)[1].frames
         self._first, self._lost = first, source.lost
 
-    def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
-        while self._index < self._end:
-            reader = self._reader or self._open_next()
-            for _, _, frame in reader:
+    def read_next(self) -> tuple[int, float, DecodedFrame] | None:
+        while self._index < self._end and (reader := self._reader or self._open_next()):
+            found = reader.read_next()
+            if found is not None:
                 index = self._index
                 self._index += 1
-                return index, float(index / self.info.fps), frame
+                return index, float(index / self.info.fps), found[2]
             self._close_reader()
-        raise StopIteration
+        return None
 
-    def _open_next(self) -> FrameReader:
+    def _open_next(self) -> FrameReader | None:
         with self._lock:
             if self._lost and not self._killed and not self._segments:
                 _LOGGER.warning("%s", self._lost)
                 self.damage, self._lost = "; ".join(filter(None, (self.damage, self._lost))), ""
             if self._killed or not self._segments:
-                raise StopIteration
+                return None
             path, info = self._segments.pop(0)
             # After a segment that is cut off, times and sound of the next one would be wrong.
             whole = bool(self._segments)
