@@ -59,3 +59,25 @@ def test_a_fixed_size_pads_or_stretches():
     array, scaled = InputFormat((64, 64), "uint8", False, stretch=True).prepare(frame, 64)
     assert scaled == (64, 64)
     assert not array.any()
+
+
+@pytest.mark.parametrize(
+    ("shape", "factor"),
+    [
+        ((720, 1280), 2),
+        ((1080, 1920), 3),
+        ((2160, 3840), 6),
+        ((1920, 1080), 3),
+        ((540, 960), 1),
+        ((721, 1281), 1),
+    ],
+)
+def test_a_reduced_frame_gives_the_same_input(shape, factor):
+    network = InputFormat(None, "uint8", False)
+    assert network.reduction(shape, 640) == factor
+    frame = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
+    reduced = cv2.resize(frame, (shape[1] // factor, shape[0] // factor), interpolation=cv2.INTER_AREA)
+    expected, scaled = network.prepare(frame, 640)
+    found, also_scaled = network.prepare(reduced, 640)
+    assert scaled == also_scaled
+    np.testing.assert_array_equal(found, expected)

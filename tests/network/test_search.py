@@ -252,3 +252,14 @@ def test_other_inputs(tmp_path, inputs):
     file.write_bytes(serialize([node], inputs, [output], [("values", values)]))
     with pytest.raises(ModelFileError, match=r"other\.onnx must have one input, float32, float16 or uint8"):
         load_network(file)
+
+
+def test_a_reduced_frame_has_the_same_vehicles_in_pixels_of_the_whole_frame(model):
+    whole = IMAGE.repeat(2, axis=0).repeat(2, axis=1)
+    with model.open_search(jobs=1) as search:
+        factor = search.reduction(whole.shape, NetworkParams())
+        expected = search.find(whole, min_vehicle_score=-1.0)
+        found = search.find(IMAGE, min_vehicle_score=-1.0).enlarged(factor)
+    assert (factor, found.shape) == (2, (720, 1280))
+    assert len(found.vehicles)
+    check_equal(found, expected)

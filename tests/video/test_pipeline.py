@@ -9,6 +9,7 @@ import threading
 import time
 import weakref
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -155,6 +156,7 @@ def test_a_drawing_may_have_a_shape_of_its_own_and_any_order(clip, tmp_path):
 INTERRUPTED = """
 import sys, time
 from pathlib import Path
+from types import SimpleNamespace
 from tests.helpers import StubDetector
 from vehicle_detection.video import process_video
 
@@ -233,6 +235,26 @@ class IntervalStub(StubDetector):
         self.steps.append((frames, cut))
         result = super().track(found, time=time, frames=frames, cut=cut)
         return FrameResult(result.index, time, Detections.empty(), Detections.empty(), ())
+
+
+class ReducingStub(StubDetector):
+    """Searches frames of half the size; the result says by which factor they were reduced."""
+
+    def reduction(self, shape):
+        return 2
+
+    def search(self, frame):
+        brightness = super().search(frame)
+        return SimpleNamespace(enlarged=lambda factor: brightness + factor)
+
+
+@pytest.mark.parametrize("draw", [True, False])
+def test_a_search_that_reduces_frames_gets_reduced_ones(clip, tmp_path, draw):
+    detector, found = ReducingStub(), []
+    target = tmp_path / "out.mp4" if draw else None
+    process_video(clip, target, detector, on_result=lambda result: found.append(result.brightness))
+    assert detector.shapes == {(24, 32, 3)}
+    assert found == pytest.approx([12 + LEVELS * n for n in range(20)], abs=2)
 
 
 @pytest.mark.parametrize("jobs", [1, 3])

@@ -6,7 +6,6 @@ camera's height to the vehicle's: a straight line for each vehicle, whose value 
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -105,11 +104,12 @@ class HorizonFilter:
 
     def _add(self, ids: NDArray[np.int64], sums: Floats) -> None:
         """Add to the sums of these vehicles, and drop vehicles whose weight has decayed."""
-        new = ids[~np.isin(ids, self._ids)]
-        self._ids = np.concatenate((self._ids, new))
-        self._sums = np.concatenate((self._sums, np.zeros((len(new), 5))))
+        new = ids[(ids[:, None] != self._ids).all(axis=1)]
+        if len(new):
+            self._ids = np.concatenate((self._ids, new))
+            self._sums = np.concatenate((self._sums, np.zeros((len(new), 5))))
         if len(ids):
-            self._sums[(self._ids[None] == ids[:, None]).argmax(axis=1)] += sums
+            self._sums[(self._ids == ids[:, None]).argmax(axis=1)] += sums
         kept = self._sums[:, 0] > _MIN_WEIGHT * self._sums[:, 0].max(initial=0.0)
         self._ids, self._sums = self._ids[kept], self._sums[kept]
 
@@ -137,8 +137,7 @@ class HorizonFilter:
         by_height, by_width = np.square(self._relative_std)
         change = math.log(max(slope / self._slope, 0.5)) / max(by_height + by_width, 1e-12)
         std = max(math.sqrt(max(float(cov[0, 0]), 0.0)), _MIN_STD_PX * camera.pixel_scale)
-        self.camera = dataclasses.replace(
-            camera,
+        self.camera = camera.with_values(
             horizon_px=horizon,
             horizon_std_px=min(std, camera.horizon_std_px),
             height_m=camera.height_m * math.exp(change * by_height),

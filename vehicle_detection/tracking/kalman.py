@@ -30,6 +30,11 @@ UNKNOWN = 1e9
 _TO_EDGES = np.array([[1, 0, -0.5, 0], [0, 1, 0, -0.5], [1, 0, 0.5, 0], [0, 1, 0, 0.5]], np.float64)
 _FROM_EDGES = np.linalg.inv(_TO_EDGES)
 _DIAGONAL = np.arange(4)
+# Blocks of 8x8 matrices: the box itself, the velocity in the rows of the box, and the velocity itself.
+_BOX, _MOTION, _VELOCITY = (
+    np.kron(block, np.eye(4)) for block in ([[1, 0], [0, 0]], [[0, 1], [0, 0]], [[0, 0], [0, 1]])
+)
+_TWICE = np.arange(8) % 4
 _MIN_SIZE = 4.0
 # Standard deviation of a new box's velocity ``[cx, cy, w, h]``, in box sizes per second.
 _INITIAL_SPEED_STD = np.array([2.0, 1.0, 0.7, 0.7])
@@ -115,11 +120,8 @@ class Measurements(NamedTuple):
         unsure: ArrayLike = False,
     ) -> Measurements:
         """Measure boxes in a frame of this shape, seen by `camera` or, by default, a pinhole camera."""
-        merged, unsure = (
-            np.broadcast_to(np.asarray(each, np.bool_), len(boxes)) for each in (merged, unsure)
-        )
-        covered = np.broadcast_to(np.asarray(covered, np.float64), len(boxes))
-        hidden = np.broadcast_to(np.asarray(hidden, np.bool_), boxes.shape)
+        merged, unsure = (np.full(len(boxes), each, np.bool_) for each in (merged, unsure))
+        covered, hidden = np.full(len(boxes), covered, np.float64), np.full(boxes.shape, hidden, np.bool_)
         road = boxes if camera is None else camera.rectify_boxes(boxes, frame)
         truncated, lateral_px = truncated_edges(boxes, frame), lateral_offsets(road, frame)
         return cls(boxes, road, truncated, lateral_px, merged, unsure, covered, hidden)
@@ -210,11 +212,11 @@ def initiate(boxes: Floats, edge_std: Floats) -> tuple[Floats, Floats]:
 def predict(mean: Floats, cov: Floats, dt: float, noise_density: Floats) -> tuple[Floats, Floats]:
     """Predict states by `dt` seconds; a velocity gains the variance `noise_density` ``(N, 4)`` per second."""
     # State [box | velocity]: box += dt * velocity. The noise is white acceleration, integrated over dt.
-    transition = np.kron([[1, dt], [0, 1]], np.eye(4))
-    noise = np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(4))
+    transition = _BOX + _MOTION * dt + _VELOCITY
+    noise = _BOX * (dt**3 / 3) + (_MOTION + _MOTION.T) * (dt**2 / 2) + _VELOCITY * dt
     predicted = mean @ transition.T
     predicted[:, 2:4] = np.maximum(predicted[:, 2:4], _MIN_SIZE)
-    cov = transition @ cov @ transition.T + noise * np.tile(noise_density, 2)[:, :, None]
+    cov = transition @ cov @ transition.T + noise * noise_density[:, _TWICE, None]
     return predicted, cov
 
 
