@@ -280,12 +280,15 @@ class SearchResult:
 
     def enlarged(self, factor: int) -> Self:
         """Return the result for a frame that was reduced by a whole factor before the search."""
-        windows, vehicles = (
-            found if found is None else found.with_columns(boxes=found.boxes * factor)
-            for found in (self.windows, self.vehicles)
+        windows, vehicles = self.windows, self.vehicles
+        if vehicles is not None:
+            vehicles = vehicles.with_columns(boxes=vehicles.boxes * factor)
+        return dataclasses.replace(
+            self,
+            windows=windows.with_columns(boxes=windows.boxes * factor),
+            vehicles=vehicles,
+            shape=(self.shape[0] * factor, self.shape[1] * factor),
         )
-        shape = self.shape[0] * factor, self.shape[1] * factor
-        return dataclasses.replace(self, windows=windows, vehicles=vehicles, shape=shape)
 
     def __repr__(self) -> str:
         return f"SearchResult(windows={self.windows}, vehicles={self.vehicles}, shape={self.shape})"
