@@ -15,6 +15,7 @@ import typer
 from typer import Argument
 
 import vehicle_detection as vd
+from vehicle_detection.cli import common
 from vehicle_detection.cli import options as shared
 from vehicle_detection.cli.horizon import is_limited, search_everywhere, warn_of_horizon
 from vehicle_detection.cli.options import (
@@ -33,15 +34,11 @@ from vehicle_detection.cli.output import (
     output_folder,
     print_error,
     print_line,
+    refuse_if,
 )
 from vehicle_detection.errors import InvalidInputError
 
 _CHECKED_IMAGES = 20  # images that are searched again if no vehicle was found
-
-
-_FOV = camera_option(
-    None, "DEG", "Field of view along the longer side in degrees, such as 90, to state distances."
-)
 
 
 class _Image(NamedTuple):
@@ -51,9 +48,7 @@ class _Image(NamedTuple):
     name: str
 
     def __str__(self) -> str:
-        from vehicle_detection._common import hide_credentials
-
-        return hide_credentials(str(self.source))
+        return str(common.hide_credentials(str(self.source)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +75,9 @@ class DetectOptions:
     )
     conf: float | None = shared.CONFIDENCE
     camera: str | None = shared.CAMERA
-    fov: float | None = _FOV
+    fov: float | None = camera_option(
+        None, "DEG", "Field of view along the longer side in degrees, such as 90, to state distances."
+    )
     camera_height: float | None = shared.CAMERA_HEIGHT
     horizon: float | None = shared.HORIZON
     labels: str = drawing_option("score", "score|none", "Labels of the boxes in annotated images.")
@@ -94,8 +91,6 @@ def detect(options: DetectOptions) -> None:
 
     Exit code 3: some images cannot be decoded, and are left out.
     """
-    from vehicle_detection._common import encodable, resolve_jobs
-
     with option_names(image="IMAGE", path="IMAGE"):
         images = list(dict.fromkeys(itertools.chain.from_iterable(map(_expand, options.images))))
     _check(options, images)
@@ -104,7 +99,7 @@ def detect(options: DetectOptions) -> None:
     camera = vd.open_camera(
         options.camera, fov=options.fov, height_m=options.camera_height, horizon=options.horizon
     )
-    jobs = resolve_jobs(options.jobs)
+    jobs = common.resolve_jobs(options.jobs)
     with (
         # Several images are searched in parallel by one thread each, which takes the least time.
         vd.Detector(
@@ -122,7 +117,7 @@ def detect(options: DetectOptions) -> None:
             deque(found, maxlen=0)
         else:
             with option_names(path="--boxes"):
-                table = vd.TrackTable.from_detections({encodable(name): each for name, each in found})
+                table = vd.TrackTable.from_detections({common.encodable(name): each for name, each in found})
                 rows = vd.write_tracks(table, options.boxes)
             print_line(f"wrote {rows} boxes to {options.boxes}")
     folders = [str(folder) for folder in (options.output, options.why) if folder is not None]
@@ -134,13 +129,11 @@ def detect(options: DetectOptions) -> None:
 
 def _expand(text: str) -> list[_Image]:
     """List the images of a folder, or of a pattern, which the shell of Windows passes on as it is."""
-    from vehicle_detection._common import check, is_url
     from vehicle_detection.images import list_images
 
-    if not text.strip():
-        raise InvalidInputError("IMAGE must be a file, a folder or a URL, got an empty name")
-    path = check.path(text, "IMAGE", kind="an image file")
-    if is_url(text):
+    refuse_if(not text.strip(), "IMAGE must be a file, a folder or a URL, got an empty name")
+    path = common.check.path(text, "IMAGE", kind="an image file")
+    if common.is_url(text):
         return [_Image(text, path.name.partition("?")[0] or "image")]
     has_pattern = ("*" in text or "?" in text) and not path.exists()
     if not path.is_dir() and not has_pattern:
@@ -151,37 +144,32 @@ def _expand(text: str) -> list[_Image]:
 
 def _check(options: DetectOptions, images: list[_Image]) -> None:
     """Refuse options and images that would fail, or be overwritten, after a part of the work is done."""
-    from vehicle_detection._common import check, check_suffix
-
     output, boxes = options.output, options.boxes
-    check.choice(options.labels, "labels", ("score", "none"))
+    common.check.choice(options.labels, "labels", ("score", "none"))
     if options.line_width is not None:
-        check.integer(options.line_width, "line_width", low=1, high=1000)
+        common.check.integer(options.line_width, "line_width", low=1, high=1000)
     by_name: dict[str, _Image] = {}
     for image in images:
         other = by_name.setdefault(image.name, image)
-        if other != image and (output is not None or boxes is not None):
-            raise InvalidInputError(
-                f"IMAGE {other} and {image} have the same file name, which identifies the results; "
-                "process one folder at a time"
-            )
+        refuse_if(
+            other != image and (output or boxes),
+            f"IMAGE {other} and {image} have the same file name, which identifies the results; process one "
+            "folder at a time",
+        )
         if isinstance(image.source, str):  # a URL
             continue
-        if not image.source.exists():
-            raise InvalidInputError(f"IMAGE {image} does not exist; check the path")
-        if boxes is not None and boxes.exists() and boxes.samefile(image.source):
-            raise InvalidInputError(f"--boxes {boxes} is one of the images; choose another name")
-        if output is not None and output.exists() and output.samefile(image.source.parent):
-            raise InvalidInputError(
-                f"--output {output} is the folder of {image.name}, which would be overwritten; choose another"
-            )
-    if boxes is not None:
-        check_suffix(boxes, "--boxes", (".csv", ".jsonl", ".ndjson", ".parquet", ".json"))
-    check_blur(options.blur)
-    if options.blur is not None and output is None and options.why is None:
-        raise InvalidInputError(
-            "--output must name a folder for --blur, which blurs annotated images; add it"
+        refuse_if(not image.source.exists(), f"IMAGE {image} does not exist; check the path")
+        is_image = boxes is not None and boxes.exists() and boxes.samefile(image.source)
+        refuse_if(is_image, f"--boxes {boxes} is one of the images; choose another name")
+        refuse_if(
+            output is not None and output.exists() and output.samefile(image.source.parent),
+            f"--output {output} is the folder of {image.name}, which would be overwritten; choose another",
         )
+    if boxes is not None:
+        common.check_suffix(boxes, "--boxes", (".csv", ".jsonl", ".ndjson", ".parquet", ".json"))
+    check_blur(options.blur)
+    unseen = options.blur and not output and not options.why
+    refuse_if(unseen, "--output must name a folder for --blur, which blurs annotated images; add it")
 
 
 def _detect_each(
@@ -195,7 +183,6 @@ def _detect_each(
     import cv2
     import numpy as np
 
-    from vehicle_detection._common import pluralize
     from vehicle_detection.drawing import draw_texts, line_width_for
 
     searched, too_small, without_distance = 0, list[str](), 0
@@ -214,7 +201,7 @@ def _detect_each(
             f"  [{' '.join(f'{side:.0f}' for side in box)}] {text}"
             for box, text in zip(found.boxes.tolist(), texts)
         )
-        print_line(f"{image}: {pluralize(len(found), 'vehicle')}{listed}")
+        print_line(f"{image}: {common.pluralize(len(found), 'vehicle')}{listed}")
         shown = pixels if options.blur is None else vd.blur_boxes(pixels, found.boxes, region=options.blur)
         name = Path(image.name)
         if options.why is not None:
@@ -234,24 +221,21 @@ def _detect_each(
         raise InvalidInputError(too_small[0])
     if without_distance:
         remedy = "" if options.horizon is not None else " without a stated --horizon"
-        print_error(
-            f"note: no distance for {pluralize(without_distance, 'vehicle')}: cut off by the frame, or seen "
-            f"from the side{remedy}"
-        )
+        count = common.pluralize(without_distance, "vehicle")
+        print_error(f"note: no distance for {count}: cut off by the frame, or seen from the side{remedy}")
     for reason in too_small:
         print_error(f"warning: {reason}; left out")
 
 
 def _texts(found: Any) -> list[str]:
     """Return the confidence of each box and, if the lens is known, its distance."""
-    from vehicle_detection._common import UNITS
     from vehicle_detection.drawing import score_texts
 
     texts = score_texts(found)
     if found.distances_m is None:
         return texts
     distances = zip(found.distances_m.tolist(), found.distance_stds_m.tolist())
-    metric = UNITS["metric"]
+    metric = common.UNITS["metric"]
     return [
         text if distance != distance else f"{text} {metric.distance_text(distance, std, with_std=True)}"
         for text, (distance, std) in zip(texts, distances)
@@ -296,12 +280,10 @@ def _write_explanations(
     folder: Path, name: str, detector: vd.Detector, image: Any, shown: Any, found: vd.Detections
 ) -> None:
     """Write a picture for each box of an image that says why it was found; it shows the image `shown`."""
-    from vehicle_detection._common import atomic_write
-
     for number, box in enumerate(found.boxes, start=1):
         explanation = vd.explain(detector, image, box)
         print_line(f"  {number}: {explanation}")
-        with atomic_write(folder / f"{name.replace('/', '_')}_{number}.png", "--why") as part:
+        with common.atomic_write(folder / f"{name.replace('/', '_')}_{number}.png", "--why") as part:
             picture: Any = vd.notebook.plot_explanation(shown, explanation)
             picture.savefig(part)
 
