@@ -101,8 +101,7 @@ class Runs:
         self.patch_set = patch_set
         self._svm_rows = folder / "rows.jsonl"
         self._extra = RowStore(folder / "extra_rows.jsonl", _EXTRA_COLUMNS)
-        # Keep one set of features at a time, to limit the memory.
-        self.cache = FeatureCache(patch_set.patches, memory_mb=0)
+        self.cache = FeatureCache(patch_set.patches)
         seeds = {"random": SEEDS, "groups": SEEDS}
         self._splits = {
             name: [
@@ -248,7 +247,7 @@ class Runs:
     def _side(
         self, params: FeatureParams, rows: NDArray[np.intp]
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        return self.cache.rows(params, rows), self._labels(rows)
+        return self.cache.features(params)[rows], self._labels(rows)
 
     def _add(self, trial: str, table: str, model: str, **cells: Any) -> None:
         self._extra.add(

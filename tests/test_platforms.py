@@ -37,7 +37,6 @@ GUARDED = {
     ("_common.threads", "available_cores", "os.sched_getaffinity"): "hasattr; macOS does not have it, either",
     ("_common.threads", "", "os.register_at_fork"): "hasattr",
     ("network.model", "", "os.register_at_fork"): "hasattr",
-    ("training.trials", "_check_memory", "os.sysconf"): "AttributeError is caught",
     ("drive.worker_pool", "_prepare", "os.setpgid"): "hasattr",
     ("_common.files", "private_folder", "os.getuid"): "hasattr",
     ("video.ffmpeg", "", "os.register_at_fork"): "hasattr",

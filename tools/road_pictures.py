@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from vehicle_detection import Annotator, Camera, DrawParams, VehicleDetector, track, write_image
 from vehicle_detection._common import atomic_write
-from vehicle_detection.notebook import plot_methods
+from vehicle_detection.notebook import show_images
 from vehicle_detection.training import rendered_source
 
 SEED = 99
@@ -30,13 +30,13 @@ def make_picture(path: Path, *, jobs: int | None = None) -> None:
     (scenes,) = rendered_source(frames=max(SCENES.values()) + 1, random_state=SEED).sets
     rendered = {key: image for key, image in scenes if key in SCENES.values()}
     images = {name: rendered[key] for name, key in SCENES.items()}
-    found = {}
-    for model in "highway", "default":
-        with VehicleDetector(model, jobs=jobs) as detector:
-            found[model] = [detector.detect(image) for image in images.values()]
     truth = [scenes.labels.frame(key) for key in SCENES.values()]
     figure = Figure(figsize=(10, 9), layout="constrained")
-    plot_methods(images, found, truth=truth, figure=figure)
+    for model, column in zip(("highway", "default"), figure.subfigures(1, 2)):
+        with VehicleDetector(model, jobs=jobs) as detector:
+            found = [detector.detect(image) for image in images.values()]
+        names = [f"{name}, {model}: {len(boxes)} boxes" for name, boxes in zip(images, found)]
+        show_images(list(images.values()), names, boxes=found, truth=truth, columns=1, figure=column)
     with atomic_write(path) as part:
         figure.savefig(part, format="jpg", dpi=90, pil_kwargs={"quality": 86})
 

@@ -7,7 +7,7 @@ import pytest
 from tests.cli import commands
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.scenes import render_scene, write_labels
-from vehicle_detection.training import read_results, trials
+from vehicle_detection.training import read_results, tuning
 
 SMALL = "spatial_size=8 hist_bins=8 pix_per_cell=16 hog_channel=0 mirror=no"
 
@@ -49,7 +49,7 @@ def test_a_grid_becomes_a_table_and_a_figure(patches, tmp_path, monkeypatch):
     assert np.ptp(read_image(plot)) == 255
     # The same command finds no configuration left to measure.
     text = out.read_text()
-    monkeypatch.setattr("vehicle_detection.training.trials.Trials.measure", None)
+    monkeypatch.setattr("vehicle_detection.training.tuning.Trials.measure", None)
     assert run(*words).exit_code == 0
     assert out.read_text() == text
 
@@ -96,7 +96,7 @@ def test_frames_are_scored(patches, material, tmp_path):
 
 
 def test_an_interrupt_keeps_the_measured_rows(patches, tmp_path, monkeypatch):
-    measure = trials.Trials.measure
+    measure = tuning.Trials.measure
     done = []
 
     def interrupted(self, *arguments, **options):
@@ -105,7 +105,7 @@ def test_an_interrupt_keeps_the_measured_rows(patches, tmp_path, monkeypatch):
         done.append(1)
         return measure(self, *arguments, **options)
 
-    monkeypatch.setattr(trials.Trials, "measure", interrupted)
+    monkeypatch.setattr(tuning.Trials, "measure", interrupted)
     result = run(*patches, "--grid", f"orient=3,4 {SMALL}", "-o", tmp_path / "table.csv")
     assert result.exit_code == 130
     assert list(read_results(tmp_path / "table.jsonl")["orient"]) == [3]

@@ -83,23 +83,6 @@ def test_the_curve_marks_the_best_f1_and_the_threshold():
     assert legend(alone)[0].startswith("best F1")
 
 
-def test_metrics_are_plotted_by_source_and_detector():
-    frames, found = labelled()
-    some = evaluate_detections(found, frames.labels)
-    best = evaluate_detections(frames.labels, frames.labels)
-    axes = notebook.plot_f1({"x": some, "y": best}, ax=new_axes())
-    assert [bar.get_height() for bar in axes.patches] == [some.f1, best.f1]
-    assert texts(axes.get_xticklabels()) == ["x", "y"]
-    assert axes.get_legend() is None
-    nested = notebook.plot_f1(
-        {"old": {"x": some}, "new": {"x": best, "y": best}}, metric="recall", ax=new_axes()
-    )
-    assert legend(nested) == ["old", "new"]
-    heights = np.array([bar.get_height() for bar in nested.patches])
-    np.testing.assert_array_equal(heights, [some.recall, np.nan, 1, 1])
-    assert nested.get_ylabel() == "recall"
-
-
 def test_the_tradeoff_marks_the_pareto_front():
     columns = {"accuracy": [0.97, 0.96, 0.99, None], "search_ms": [4, 5, 9, 1]}
     table = pd.DataFrame({"configuration": ["a", "b", "c", "d"]} | columns)
@@ -112,29 +95,3 @@ def test_the_tradeoff_marks_the_pareto_front():
     other = notebook.plot_tradeoff(table, label=None)
     assert other.figure is not given.figure
     assert not other.texts
-
-
-def test_a_parameter_is_plotted_with_the_deviation_of_its_runs():
-    table = pd.DataFrame({"C": [1e-4, 1e-4, 1.0, None], "split": ["x"] * 4, "accuracy": [0.9, 1.0, 0.8, 0.1]})
-    axes = notebook.plot_parameter(table, "C", by="split", ax=new_axes())
-    line = axes.lines[0]
-    np.testing.assert_allclose(line.get_xydata(), [[1e-4, 0.95], [1.0, 0.8]])
-    (bars,) = axes.containers
-    several, single = bars[2][0].get_segments()
-    assert np.ptp(several[:, 1]) / 2 == pytest.approx(np.std([0.9, 1.0], ddof=1))
-    assert not len(single)  # a single run has no deviation
-    assert (axes.get_xscale(), axes.get_xlabel(), axes.get_ylabel()) == ("log", "C", "accuracy on patches")
-    assert legend(axes) == ["x"]
-
-
-def test_the_legend_counts_the_errors_of_both_classes():
-    scores, labels = [2.0, 1.0, -0.25, 0.0, -1.0, 0.5], [1, 1, 1, 1, 0, 0]
-    axes = notebook.plot_scores(scores, labels, bins=12, ax=new_axes())
-    assert legend(axes) == [
-        "vehicles: 2 of 4 missed", "other: 1 of 2 classified as vehicles", "threshold 0",
-    ]  # fmt: skip
-    assert axes.get_yscale() == "log"
-    assert axes.get_xlabel() == "score (decision value)"
-    assert axes.lines[0].get_xdata() == [0, 0]
-    strict = notebook.plot_scores(scores, labels, threshold=1.5, ax=new_axes())
-    assert legend(strict)[:2] == ["vehicles: 3 of 4 missed", "other: 0 of 2 classified as vehicles"]

@@ -60,27 +60,6 @@ def test_bands_are_drawn_where_they_are_searched(preset):
     assert colors == [pytest.approx(color) for color in (YELLOW, SKY, VERMILION)]
 
 
-def test_the_comparison_shows_all_scores_and_their_maximum_difference():
-    reference = np.linspace(-3, 2, 50)
-    fast = reference + np.where(np.arange(50) == 7, -3e-6, 1e-6)
-    figure = notebook.plot_comparison(fast, reference)
-    left, right = figure.axes
-    np.testing.assert_allclose(left.collections[0].get_offsets(), np.stack([reference, fast], axis=1))
-    assert right.get_title() == "maximum difference 3e-06"
-    assert sum(bar.get_height() for bar in right.patches) == 50
-    assert notebook.plot_comparison([1.0], [1.0]).axes[1].get_title() == "maximum difference 0"
-
-
-def test_speedups_over_the_slowest_or_a_chosen_method():
-    times = {"a": 2.0, "b": 0.5, "c": 0.002}
-    axes = notebook.plot_speedups(times, ax=new_axes())
-    assert texts(axes.texts) == ["2,000 ms", "500 ms, 4.0x faster", "2 ms, 1,000x faster"]
-    assert [bar.get_width() for bar in axes.patches] == [2000, 500, 2]
-    assert (axes.get_xscale(), axes.get_xlabel()) == ("log", "time (ms)")
-    other = notebook.plot_speedups(times, reference="b", ax=new_axes())
-    assert texts(other.texts) == ["2,000 ms, 4.0x slower", "500 ms", "2 ms, 250x faster"]
-
-
 def test_the_heat_map_and_its_regions():
     windows = Detections([[10, 10, 50, 50], [20, 10, 60, 50], [100, 20, 140, 60]], [1.5, 1.0, 3.0])
     params = HeatParams(threshold=1.0, peak_fraction=0.2)

@@ -1,16 +1,13 @@
-from fractions import Fraction
-
 import numpy as np
 from matplotlib.colors import to_rgb
 
-from tests.notebook.helpers import legend, new_axes, texts
+from tests.notebook.helpers import texts
 from vehicle_detection import notebook
 from vehicle_detection.boxes import Detections
 from vehicle_detection.notebook.style import COLORS
 from vehicle_detection.scenes import render_drive
 from vehicle_detection.tables import TrackTable
 from vehicle_detection.tracking import FrameResult, Track
-from vehicle_detection.video import VideoReport
 
 
 def track(number, x, **changes):
@@ -22,8 +19,8 @@ def track(number, x, **changes):
     return Track(**{**known, **changes})
 
 
-def result(index, *tracks, time=None, seconds=None):
-    return FrameResult(index, time, Detections.empty(), Detections.empty(), tracks, seconds or {})
+def result(index, *tracks, time=None):
+    return FrameResult(index, time, Detections.empty(), Detections.empty(), tracks)
 
 
 def test_tracks_are_plotted_over_time():
@@ -71,24 +68,3 @@ def test_tracks_of_a_file_are_compared_with_the_truth_of_a_drive():
     ignored = TrackTable([0, 1], [1, 2], [[0, 0, 9, 9]] * 2, ignore=[False, True])
     both = notebook.plot_tracks(labels, truth=ignored)
     assert len(both.axes[0].lines) == count + 1
-
-
-REPORT = VideoReport(
-    frames=100, fps=Fraction(25), shape=(720, 1280, 3), seconds=2.0,
-    stages={"encode": 1.0, "decode": 0.5, "search": 0.75}, tracks=1,
-)  # fmt: skip
-
-
-def test_stage_times_of_a_report_and_of_results():
-    stills = [result(index, seconds={"search": 0.01, "track": 0.002 * index}) for index in range(2)]
-    axes = notebook.plot_stage_times({"video": REPORT, "stills": stills}, ax=new_axes())
-    # in the order of processing
-    assert legend(axes) == ["decode", "search", "track", "encode"]
-    widths = np.array([bar.get_width() for bar in axes.patches]).reshape(4, 2)
-    np.testing.assert_allclose(widths, [[5, 0], [7.5, 10], [0, 1], [10, 0]])
-    starts = np.array([bar.get_x() for bar in axes.patches]).reshape(4, 2)
-    np.testing.assert_allclose(starts, np.cumsum(widths, axis=0) - widths, atol=1e-9)
-    assert texts(axes.get_yticklabels()) == ["video", "stills"]
-    assert {"  22.5 ms", "  11.0 ms"} <= set(texts(axes.texts))
-    assert axes.get_xlabel() == "work (ms per frame)"
-    assert texts(notebook.plot_stage_times(REPORT, ax=new_axes()).get_yticklabels()) == [""]

@@ -11,7 +11,7 @@ from vehicle_detection.training import (
     read_results,
     write_results,
 )
-from vehicle_detection.training.trials import COLUMNS
+from vehicle_detection.training.tuning import COLUMNS
 
 
 def example_row(number):

@@ -10,14 +10,12 @@ from vehicle_detection.features import FeatureParams
 from vehicle_detection.tables import TrackTable
 from vehicle_detection.training import (
     FeatureCache,
-    RowStore,
     TrainingOptions,
     TrialOptions,
     compare_configurations,
     train_classifier,
-    trials,
 )
-from vehicle_detection.training.trials import COLUMNS, Trials, read_configurations
+from vehicle_detection.training.tuning import Trials, read_configurations
 
 PARAMS = FeatureParams(**SMALL)
 
@@ -38,20 +36,12 @@ def test_a_trial_equals_training_on_that_part(patch_set, mirror, split):
         options=TrainingOptions(C=0.01, mirror=mirror, random_state=3),
     )
     (candidate,) = read_configurations([{**SMALL, "C": 0.01, "mirror": mirror}])
-    tried = Trials(patch_set, UNTIMED, RowStore(None, COLUMNS)).train(candidate, parts.train, 3)
+    tried = Trials(patch_set, UNTIMED).train(candidate, parts.train, 3)
     np.testing.assert_array_equal(tried.templates[0].coef, classifier.templates[0].coef)
     assert row["accuracy"] == classifier.score(test.patches, test.labels)
     assert row["train_accuracy"] == classifier.score(train.patches, train.labels)
     assert (row["train_size"], row["test_size"]) == (len(train), len(test))
     assert row["mirror"] is mirror
-
-
-def test_features_that_exceed_the_memory_fail(patch_set, monkeypatch):
-    monkeypatch.setattr(trials.os, "sysconf", lambda name: 100)
-    table = compare_configurations(patch_set, [{**SMALL, "mirror": False}], options=UNTIMED)
-    assert table["status"].tolist() == ["failed"]
-    message = table["message"][0]
-    assert "features of 96 patches needs about 1 GB, but this machine has 0 GB" in message
 
 
 def test_frames_are_scored_like_the_detector(patch_set, frames, labels):

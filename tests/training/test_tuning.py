@@ -12,7 +12,7 @@ from vehicle_detection.training import (
     parse_grid,
     read_results,
 )
-from vehicle_detection.training.trials import COLUMNS
+from vehicle_detection.training.tuning import COLUMNS
 
 
 def compare(patch_set, configurations, **options):
@@ -123,9 +123,9 @@ def test_the_text_of_a_grid(text, message):
     ("grid", "message"),
     [
         ({}, r"grid must map option names \(color_space, .*\) to lists of values; got"),
-        ({"orient": 8}, r"grid\['orient'\] must be a list of values; got 8"),
+        ({"orient": 8}, r"grid\['orient'\] must be a list of values, one or more; got 8"),
         ({"color_space": "LAB"}, r"grid\['color_space'\] must be a list of values"),
-        ({"orient": []}, r"grid\['orient'\] must hold at least one value"),
+        ({"orient": []}, r"grid\['orient'\] must be a list of values, one or more"),
     ],
 )
 def test_invalid_grids(grid, message):

@@ -2,7 +2,7 @@
 
 from vehicle_detection.search import SearchBand, SearchParams
 from vehicle_detection.training import TrialOptions
-from vehicle_detection.training.trials import Trials
+from vehicle_detection.training.tuning import Trials
 
 SMALL = {"spatial_size": 8, "hist_bins": 8, "orient": 4, "pix_per_cell": 16, "hog_channel": 0}
 SMALL_GRID = {name: [value] for name, value in SMALL.items()}

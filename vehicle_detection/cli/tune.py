@@ -140,8 +140,7 @@ def _compare_models(
         patches = vd.load_training_patches(*sources, progress=sys.stderr.isatty())
         configurations = vd.training.expand_grid(values)
         if finalists is not None:
-            measured, seed = options["options"], options["seeds"][0]
-            halved = {"split": options["splits"], "random_state": seed, "options": measured}
+            halved = {"split": options["splits"], "random_state": options["seeds"][0]}
             found = vd.training.halve_configurations(patches, configurations, finalists, **halved)
             configurations = found or configurations  # all are impossible, which their rows say
         return vd.training.compare_configurations(patches, configurations, progress=True, **options)

@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from vehicle_detection._common import (
-    check_array,
     check_choice,
     check_integer,
     check_number,
@@ -21,14 +20,13 @@ from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import (
-    DetectionScores,
     LabelledFrames,
     best_f1,
     match_detections,
     prepare_evaluation,
 )
 from vehicle_detection.notebook import style
-from vehicle_detection.notebook.style import LINE_COLORS, OTHER, SKY, TRUTH, VEHICLE, VERMILION, Image
+from vehicle_detection.notebook.style import SKY, TRUTH, VERMILION, Image
 from vehicle_detection.tables import FrameKey, TrackTable
 from vehicle_detection.training import check_column, numeric_column, pareto_front
 
@@ -37,58 +35,6 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 Curve = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
-
-_METRICS = ("f1", "precision", "recall", "average_precision", "mean_iou")
-_METRIC_NAMES = {"f1": "F1", "average_precision": "average precision", "mean_iou": "mean IoU"}
-
-
-def plot_scores(
-    scores: ArrayLike, labels: ArrayLike, *, threshold: float = 0.0, bins: int = 60, ax: Axes | None = None
-) -> Axes:
-    """Plot histograms of the scores of both classes, on a logarithmic scale that makes errors visible.
-
-    `labels` are 1 for a vehicle, 0 for anything else. Patches with scores above `threshold`, the vertical
-    line, are classified as vehicles; the legend counts the errors.
-
-    >>> axes = plot_scores([1.0, 2.0, -0.5, -2.0], [1, 1, 1, 0])
-    >>> [text.get_text() for text in axes.get_legend().get_texts()]
-    ['vehicles: 1 of 3 missed', 'other: 0 of 1 classified as vehicles', 'threshold 0']
-    """
-    from matplotlib.ticker import LogFormatter
-
-    values, known = style.check_scores(scores, "scores"), check_array(labels, "labels")
-    if known.shape != values.shape or not np.isin(known, (0, 1)).all():
-        raise InvalidInputError(
-            f"labels must be 0 or 1 for each of the {len(values)} scores; got {describe(known)}"
-        )
-    limit = check_number(threshold, "threshold")
-    edges = _bin_edges(values, limit, check_integer(bins, "bins", low=1, high=10_000))
-    axes = style.new_axes(ax)
-    classes = ((1, VEHICLE, "vehicles", "missed"), (0, OTHER, "other", "classified as vehicles"))
-    for vehicle, color, name, error in classes:
-        own = values[known == vehicle]
-        errors = int(((own > limit) != vehicle).sum())
-        counts = np.histogram(own, edges)[0]
-        axes.stairs(counts, edges, fill=True, color=color, alpha=0.35)
-        label = f"{name}: {errors:,} of {len(own):,} {error}"
-        axes.stairs(counts, edges, color=color, linewidth=1.4, label=label)
-    axes.axvline(limit, color="black", linestyle="--", linewidth=1, label=f"threshold {limit:g}")
-    axes.set(yscale="log", xlabel="score (decision value)", ylabel="patches")
-    axes.set_ylim(bottom=0.7)
-    # The default formatter writes 4x10^0 on an axis of less than a decade.
-    axes.yaxis.set_major_formatter("{x:,.0f}")
-    axes.yaxis.set_minor_formatter(LogFormatter())
-    style.legend_above(axes, 3)
-    return axes
-
-
-def _bin_edges(values: NDArray[np.float64], threshold: float, count: int) -> NDArray[np.float64]:
-    """Edges of about `count` bins, one of them at the threshold, so that no bin mixes both decisions."""
-    low, high = min(float(values.min()), threshold), max(float(values.max()), threshold)
-    width = (high - low) / count or 1.0
-    before = np.ceil((threshold - low) / width)
-    after = np.floor((high - threshold) / width) + 1
-    return np.asarray(threshold + width * np.arange(-before, after + 1), np.float64)
 
 
 def plot_precision_recall(
@@ -141,51 +87,6 @@ def _check_curve(curve: object, name: str) -> Curve:
     if precision.ndim != 1 or not precision.size or np.isnan(recall).any():
         raise InvalidInputError(f"{text} must be computed from detections and labelled vehicles; got none")
     return precision, recall, thresholds
-
-
-def plot_f1(
-    scores: Mapping[str, DetectionScores] | Mapping[str, Mapping[str, DetectionScores]],
-    *,
-    metric: str = "f1",
-    ax: Axes | None = None,
-) -> Axes:
-    """Plot a metric on each source of frames as bars, for one detector or several.
-
-    `scores` are results of `evaluate_detections` by source; or by detector, then by source. Unknown values
-    have no bar. `metric` is ``"f1"``, ``"precision"``, ``"recall"``, ``"average_precision"`` or
-    ``"mean_iou"``.
-
-    >>> from vehicle_detection import evaluate_detections
-    >>> labels = TrackTable([0], None, [[0, 0, 50, 40]])
-    >>> axes = plot_f1({"road": evaluate_detections(labels, labels)})
-    >>> [text.get_text() for text in axes.texts]
-    ['1.00']
-    """
-    check_choice(metric, "metric", _METRICS)
-    remedy = "pass what evaluate_detections returns"
-    style.check_mapping(scores, "scores", "sources to DetectionScores", remedy)
-    nested = all(isinstance(value, Mapping) for value in scores.values())
-    detectors: dict[str, Any] = dict(scores) if nested else {"": scores}
-    for by_source in detectors.values():
-        for source, value in by_source.items():
-            check_type(value, f"scores[{source!r}]", DetectionScores, remedy)
-    sources = list(dict.fromkeys(source for by_source in detectors.values() for source in by_source))
-    if not sources:
-        raise InvalidInputError("scores must hold at least one source; got none")
-    axes = style.new_axes(ax, 2.5 + 1.3 * len(sources), 4)
-    width = 0.8 / len(detectors)
-    for number, (name, by_source) in enumerate(detectors.items()):
-        values = [getattr(by_source.get(source), metric, np.nan) for source in sources]
-        positions = np.arange(len(sources)) + (number - (len(detectors) - 1) / 2) * width
-        color = LINE_COLORS[number % len(LINE_COLORS)]
-        bars = axes.bar(positions, values, width * 0.94, color=color, label=name)
-        axes.bar_label(bars, ["" if np.isnan(v) else f"{v:.2f}" for v in values], padding=2, fontsize=8)
-    _name_ticks(axes, [str(source) for source in sources])
-    axes.set(ylim=(0, 1.1), ylabel=_METRIC_NAMES.get(metric, metric))
-    axes.spines[["top", "right"]].set_visible(False)
-    if nested:
-        style.legend_above(axes, 3)
-    return axes
 
 
 def plot_errors(
@@ -272,10 +173,6 @@ def _caption(side: TrackTable, row: int, predictions: TrackTable, kind: str) -> 
     return f"{name if len(name) <= 24 else '...' + name[-21:]}\n{text}"
 
 
-# Ratio of the largest to the smallest value above which the x axis is logarithmic.
-_LOG_RATIO = 20
-# Width of a character of a tick label as a fraction of the font's size; axes grow when they are laid out.
-_CHARACTER_WIDTH = 0.5
 # Quantities of columns of results whose names do not say them.
 _QUANTITIES = {
     "accuracy": "accuracy on patches",
@@ -338,62 +235,6 @@ def plot_tradeoff(
     return axes
 
 
-def plot_parameter(
-    table: DataFrame,
-    parameter: str,
-    *,
-    quality: str = "accuracy",
-    by: str | None = None,
-    ax: Axes | None = None,
-) -> Axes:
-    """Plot the mean of a measurement against a parameter.
-
-    `parameter` and `quality` are the columns of both axes in a `table` as in `plot_tradeoff`. There is a line
-    for each value of the column `by`, such as ``"split"``, with the standard deviation over rows with the
-    same `parameter` and `by` as error bars. The x axis is logarithmic if its numbers span more than a factor
-    of 20, and evenly spaced if it holds text.
-
-    >>> import pandas as pd
-    >>> table = pd.DataFrame({"C": [1e-4, 1.0], "accuracy": [0.99, 0.98]})
-    >>> plot_parameter(table, "C").get_xscale()
-    'log'
-    """
-    columns = [parameter] if by is None else [parameter, by]
-    for name in columns:
-        check_column(table, name)
-    measured = table[~np.isnan(numeric_column(table, quality))].dropna(subset=columns).reset_index(drop=True)
-    if measured.empty:
-        raise InvalidInputError(f"table has no row with both {parameter} and {quality}; measure them first")
-    axes = style.new_axes(ax)
-    values = measured[parameter].tolist()
-    numeric = all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
-    x, names = (np.array(values), ()) if numeric else measured[parameter].factorize()
-    groups = [(None, measured)] if by is None else measured.groupby(by, sort=False)
-    for (name, rows), (color, dash) in zip(groups, style.line_styles()):
-        runs = rows[quality].groupby(x[rows.index]).agg(["mean", "std"])
-        look: dict[str, Any] = {"fmt": "o", "linestyle": dash, "color": color, "capsize": 3, "markersize": 4}
-        lines = axes.errorbar(runs.index, runs["mean"], runs["std"], **look)
-        lines.set_label(None if by is None else str(name))
-    if not numeric:
-        _name_ticks(axes, [str(name) for name in names])
-    elif x.min() > 0 and x.max() > _LOG_RATIO * x.min():
-        axes.set_xscale("log")
-    axes.set(xlabel=_quantity(parameter), ylabel=_quantity(quality))
-    axes.grid(alpha=0.3)
-    if by is not None:
-        axes.legend(title=_quantity(by), fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
-    return axes
-
-
 def _quantity(column: str) -> str:
     """Name of a column's quantity with its unit."""
     return _QUANTITIES.get(column, column.replace("_", " "))
-
-
-def _name_ticks(axes: Axes, texts: list[str]) -> None:
-    """Write a text at each position 0, 1, ... of the x axis, turned if they are long."""
-    axes.set_xticks(range(len(texts)), texts)
-    points = axes.get_window_extent().width * 72 / axes.figure.dpi
-    character = _CHARACTER_WIDTH * float(axes.get_xticklabels()[0].get_fontsize())
-    if max(map(len, texts)) * len(texts) * character > points:
-        axes.set_xticks(range(len(texts)), texts, rotation=30, ha="right", rotation_mode="anchor")

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from vehicle_detection._common import check_choice, check_image, check_number, check_type, describe, pluralize
+from vehicle_detection._common import check_image, check_type, describe, pluralize
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import HeatParams, frame_heat, heat_threshold, label_heat
 from vehicle_detection.notebook import style
-from vehicle_detection.notebook.style import BLUE, SKY, TRUTH, VERMILION, YELLOW, Boxes, FigureLike, Image
+from vehicle_detection.notebook.style import SKY, TRUTH, VERMILION, YELLOW, Boxes, FigureLike, Image
 from vehicle_detection.search import SearchParams
 from vehicle_detection.windows import band_windows
 
@@ -118,74 +117,6 @@ def plot_bands(
     )
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
     return figure
-
-
-def plot_comparison(fast: ArrayLike, reference: ArrayLike, *, figure: FigureLike | None = None) -> FigureLike:
-    """Plot ``(N,)`` scores of the fast search against those of the reference, for the same windows in order.
-
-    Beside the scatter plot is a histogram of the differences, whose title states the maximum.
-
-    >>> figure = plot_comparison([0.5, 1.0], [0.5, 1.25])
-    >>> figure.axes[1].get_title()
-    'maximum difference 0.25'
-    """
-    x, y = style.check_scores(reference, "reference"), style.check_scores(fast, "fast")
-    if len(x) != len(y):
-        raise InvalidInputError(
-            f"fast and reference must be scores of the same windows; got {len(y)} and {len(x)} scores"
-        )
-    figure, ((left, right),) = style.new_panels(figure, (10, 4.2), 1, 2)
-    ends = [min(x.min(), y.min()), max(x.max(), y.max())]
-    left.plot(ends, ends, color="0.3", linewidth=0.8, label="equal")
-    left.scatter(x, y, s=5, color=BLUE, alpha=0.5, linewidths=0, label=pluralize(len(x), "window"))
-    left.set(xlabel="score of the reference search", ylabel="score of the fast search")
-    left.legend(fontsize=9)
-    difference = float(np.abs(y - x).max())
-    limit = difference or 1e-12
-    right.hist(y - x, bins=60, range=(-limit, limit), color=BLUE)
-    right.set(yscale="log", xlabel="fast - reference", ylabel="windows")
-    right.set_title(f"maximum difference {difference:.2g}", fontsize=10)
-    right.ticklabel_format(axis="x", style="sci", scilimits=(-3, 3))
-    return figure
-
-
-def plot_speedups(
-    seconds: Mapping[str, float], *, reference: str | None = None, ax: Axes | None = None
-) -> Axes:
-    """Plot the times of several methods for the same work, and their speedups over `reference`.
-
-    None for `reference` is the slowest method.
-
-    >>> axes = plot_speedups({"one by one": 4.0, "shared": 0.01})
-    >>> [text.get_text() for text in axes.texts]
-    ['4,000 ms', '10 ms, 400x faster']
-    """
-    style.check_mapping(seconds, "seconds", "names to seconds", 'pass {"one by one": 4.0, "shared": 0.01}')
-    times = {str(name): check_number(value, f"seconds[{name!r}]", above=0) for name, value in seconds.items()}
-    baseline = max(times, key=times.__getitem__) if reference is None else reference
-    check_choice(baseline, "reference", times)
-    # Long names take width from the bars.
-    width = 7.0 + 0.07 * max(map(len, times))
-    axes = style.new_axes(ax, width, 0.8 + 0.45 * len(times))
-    values = [1000 * value for value in times.values()]
-    bars = axes.barh(list(times), values, color=["0.6" if name == baseline else BLUE for name in times])
-    texts = [_format_time(value, times[baseline] / value) for value in times.values()]
-    axes.bar_label(bars, texts, padding=3, fontsize=9)
-    left = min(values) / 3
-    # Room for the text of the longest bar.
-    right = max(values) * max(12.0, (max(values) / left) ** 0.6)
-    axes.set(xscale="log", xlim=(left, right), xlabel="time (ms)")
-    axes.invert_yaxis()
-    axes.spines[["top", "right"]].set_visible(False)
-    return axes
-
-
-def _format_time(seconds: float, speedup: float) -> str:
-    """Time in milliseconds with its speedup, such as ``10 ms, 400x faster``."""
-    text = f"{1000 * seconds:,.0f} ms" if seconds >= 0.01 else f"{1000 * seconds:.2g} ms"
-    if speedup < 1:
-        return f"{text}, {1 / speedup:.1f}x slower"
-    return text if speedup == 1 else f"{text}, {speedup:,.{0 if speedup >= 10 else 1}f}x faster"
 
 
 def plot_heatmap(

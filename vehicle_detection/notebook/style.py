@@ -128,12 +128,6 @@ def check_displayable(image: object, name: str) -> NDArray[Any]:
     return check_image(image, name)
 
 
-def check_mapping(values: object, name: str, contents: str, remedy: str) -> None:
-    """Check that `values` is a mapping with at least one entry."""
-    if not isinstance(values, Mapping) or not values:
-        raise InvalidInputError(f"{name} must map {contents}, at least one; got {describe(values)}; {remedy}")
-
-
 def check_list(values: object, name: str, kind: str) -> list[Any]:
     """Return `values` as a list with at least one entry; `kind` names the entries in the message."""
     single = isinstance(values, (str, bytes)) or (isinstance(values, np.ndarray) and values.ndim < 4)
@@ -168,16 +162,6 @@ def check_numbers(values: ArrayLike | None, name: str, count: int, entries: str)
             f"{name} must be one number for each of {count} {entries}; got {describe(array)}"
         )
     return array
-
-
-def check_scores(scores: ArrayLike, name: str) -> NDArray[np.float64]:
-    """Return `scores` as ``(N,)`` finite float64, N >= 1."""
-    array = check_array(scores, name)
-    if array.ndim != 1 or not array.size or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
-        raise InvalidInputError(
-            f"{name} must be a list of finite numbers, at least one; got {describe(array)}"
-        )
-    return array.astype(np.float64)
 
 
 def split_titles(images: object, titles: Sequence[str] | None = None) -> tuple[list[Any], list[Any]]:

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vehicle_detection._common import Floats, check_number, check_type, describe
+from vehicle_detection._common import Floats, check_number, check_type
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.notebook import style
 from vehicle_detection.notebook.style import COLORS, LINESTYLES, YELLOW, FigureLike
 from vehicle_detection.tables import TrackTable
 from vehicle_detection.tracking import FrameResult
-from vehicle_detection.video import VideoReport
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 
 _LABELS = (
@@ -34,8 +32,6 @@ _DARK_YELLOW = (0.80, 0.73, 0.1)
 
 # Rows of the legend of the tracks that fit beside the panels.
 _LEGEND_ROWS = 38
-
-_STAGES = ("decode", "search", "regions", "track", "draw", "encode")
 
 
 def plot_tracks(
@@ -122,64 +118,3 @@ def _insert_gaps(columns: Floats, rate: float) -> Floats:
     result = np.insert(columns, after, math.nan, axis=1)
     result[0] = np.insert(time, after, (time[after - 1] + time[after]) / 2)
     return result
-
-
-Run = VideoReport | Sequence[FrameResult]
-
-
-def plot_stage_times(runs: Run | Mapping[str, Run], *, ax: Axes | None = None) -> Axes:
-    """Plot the processing time per frame of each stage, for one run or several.
-
-    `runs` is the report of `process_video`, or the detector's result of each frame; or several of them by
-    name. Stages of a video run in parallel, so a bar may be longer than the time between two frames.
-
-    >>> result = FrameResult(0, 0.0, None, None, (), {"search": 0.012, "track": 0.002})
-    >>> axes = plot_stage_times([result])
-    >>> [text.get_text() for text in axes.get_legend().get_texts()]
-    ['search', 'track']
-    """
-    named = runs if isinstance(runs, Mapping) else {"": runs}
-    if not named:
-        raise InvalidInputError("runs must hold at least one run; got none")
-    times = {str(name): _stage_milliseconds(run) for name, run in named.items()}
-    stages = list(dict.fromkeys([*_STAGES, *(stage for run in times.values() for stage in run)]))
-    stages = [stage for stage in stages if any(stage in run for run in times.values())]
-    axes = style.new_axes(ax, 9, 1.3 + 0.55 * len(times))
-    left = np.zeros(len(times))
-    longest = max(sum(run.values()) for run in times.values())
-    for number, stage in enumerate(stages):
-        values = np.array([run.get(stage, 0.0) for run in times.values()])
-        color = COLORS[number % len(COLORS)]
-        bars = axes.barh(range(len(times)), values, 0.6, left=left, color=color, label=stage)
-        # A number does not fit into a short bar.
-        texts = [f"{value:.1f}" if value > 0.05 * longest else "" for value in values]
-        axes.bar_label(bars, texts, label_type="center", fontsize=8)
-        left += values
-    for row, total in enumerate(left):
-        axes.text(total, row, f"  {total:.1f} ms", va="center", fontsize=9)
-    axes.set_yticks(range(len(times)), list(times))
-    axes.invert_yaxis()
-    axes.margins(x=0.12)
-    axes.set_xlabel("work (ms per frame)")
-    style.legend_above(axes, max(len(stages), 1))
-    axes.spines[["top", "right"]].set_visible(False)
-    return axes
-
-
-def _stage_milliseconds(run: object) -> dict[str, float]:
-    """Milliseconds per frame of each stage."""
-    if isinstance(run, VideoReport):
-        frames, parts = run.frames, [run.stages]
-    elif isinstance(run, (list, tuple)) and all(isinstance(result, FrameResult) for result in run):
-        frames, parts = len(run), [result.seconds for result in run]
-    else:
-        raise InvalidInputError(
-            "runs must be a VideoReport or a list of FrameResult, or a mapping from names to them; "
-            f"got {describe(run)}"
-        )
-    if not frames:
-        raise InvalidInputError("runs must have at least one frame each; got a run without any")
-    seconds: Counter[str] = Counter()
-    for part in parts:
-        seconds.update(part)
-    return {stage: 1000 * value / frames for stage, value in seconds.items()}

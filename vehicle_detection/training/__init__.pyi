@@ -43,11 +43,11 @@ from .results import pareto_front as pareto_front
 from .results import read_results as read_results
 from .results import write_results as write_results
 from .searches import compare_searches as compare_searches
-from .trials import TrialOptions as TrialOptions
-from .trials import expand_grid as expand_grid
-from .trials import parse_grid as parse_grid
+from .tuning import TrialOptions as TrialOptions
 from .tuning import compare_configurations as compare_configurations
+from .tuning import expand_grid as expand_grid
 from .tuning import halve_configurations as halve_configurations
+from .tuning import parse_grid as parse_grid
 from .validation import FOLD_COLUMNS as FOLD_COLUMNS
 from .validation import FoldDetections as FoldDetections
 from .validation import FoldScore as FoldScore

@@ -1,23 +1,24 @@
-"""Features of a set of patches, computed once per parameter set and kept in memory and on disk."""
+"""Features of a set of patches, computed once per parameter set and kept on disk."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import io
 import json
 import os
-from collections import OrderedDict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import vehicle_detection
-from vehicle_detection._common import atomic_write, check_number, check_patches, check_path
+from vehicle_detection._common import atomic_write, check_patches, check_path
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import PATCH_SIZE, FeatureParams, extract_features
+from vehicle_detection.features import PATCH_SIZE, FeatureParams
+from vehicle_detection.training.classifier import TrainingOptions, patch_features
 
 
 def digest_of(*parts: Any) -> str:
@@ -28,21 +29,17 @@ def digest_of(*parts: Any) -> str:
             digest.update(f"{part.shape}{part.dtype}".encode())
             digest.update(np.ascontiguousarray(part).tobytes())
         else:
-            digest.update(json.dumps(part, sort_keys=True).encode())
+            digest.update(json.dumps(part, sort_keys=True, default=np.generic.item).encode())
         digest.update(b"\n")
     return digest.hexdigest()[:16]
 
 
 class FeatureCache:
-    """Feature vectors of one set of patches by parameters.
-
-    `patches` is ``(N, 64, 64, 3)`` uint8 RGB. `folder` keeps a ``.npy`` file for each set between runs.
-    Beyond `memory_mb` megabytes the least recently used sets are dropped from memory, but one set is always
-    kept. `jobs` is the number of threads.
+    """Features of ``(N, 64, 64, 3)`` patches: the last ones in memory, all as files in a folder if given.
 
     >>> cache = FeatureCache(np.zeros((3, 64, 64, 3), np.uint8))
-    >>> cache.all(FeatureParams()) is cache.all(FeatureParams())
-    True
+    >>> cache.features(FeatureParams(), mirror=True).shape
+    (6, 6156)
     """
 
     def __init__(
@@ -50,12 +47,10 @@ class FeatureCache:
         patches: NDArray[np.uint8],
         *,
         folder: str | os.PathLike[str] | None = None,
-        memory_mb: float = 2000.0,
         jobs: int | None = None,
     ) -> None:
         self.patches = check_patches(patches, PATCH_SIZE)
         self.digest = digest_of(self.patches)
-        self._max_bytes = check_number(memory_mb, "memory_mb", low=0) * 1e6
         self._jobs = jobs
         self._folder = None if folder is None else check_path(folder, "cache", kind="a folder")
         if self._folder is not None:
@@ -65,44 +60,26 @@ class FeatureCache:
                 raise InvalidInputError(
                     f"cache must be a folder, {folder} cannot be created ({error.strerror}); choose another"
                 ) from error
-        self._in_memory: OrderedDict[tuple[FeatureParams, bool], NDArray[np.float32]] = OrderedDict()
+        self._last = functools.lru_cache(1)(self._read)
 
-    def rows(
-        self, params: FeatureParams, rows: NDArray[np.intp], *, mirrored: bool = False
-    ) -> NDArray[np.float32]:
-        """Features of some patches as a new ``(len(rows), length)`` float32 array."""
-        return self.all(params, mirrored=mirrored)[rows]
+    def features(self, params: FeatureParams, *, mirror: bool = False) -> NDArray[np.float32]:
+        """Features of all patches, not to be changed; `mirror` adds those of their mirror images."""
+        return self._last(params, mirror)
 
-    def all(self, params: FeatureParams, *, mirrored: bool = False) -> NDArray[np.float32]:
-        """Features of all patches, or of the mirrored patches: ``(N, length)`` float32, read-only."""
-        key, cached = (params, mirrored), self._in_memory
-        if key not in cached:
-            cached[key] = self._read(params, mirrored)
-            cached[key].setflags(write=False)
-        cached.move_to_end(key)
-        while len(cached) > 1 and sum(each.nbytes for each in cached.values()) > self._max_bytes:
-            cached.popitem(last=False)
-        return cached[key]
-
-    def _read(self, params: FeatureParams, mirrored: bool) -> NDArray[np.float32]:
+    def _read(self, params: FeatureParams, mirror: bool) -> NDArray[np.float32]:
         """Read features from their file; compute and write them if it is missing or damaged."""
-        facts = dataclasses.asdict(params), mirrored, vehicle_detection.__version__
+        facts = dataclasses.asdict(params), mirror, vehicle_detection.__version__
         path = self._folder and self._folder / f"{digest_of(self.digest, *facts)}.npy"
+        features = None
         if path and path.exists():
             with contextlib.suppress(OSError, ValueError, EOFError):
                 features = np.asarray(np.load(path, allow_pickle=False))
-                if features.shape == (len(self.patches), params.length) and features.dtype == np.float32:
-                    return features
-        patches = np.ascontiguousarray(self.patches[:, :, ::-1]) if mirrored else self.patches
-        features = extract_features(patches, params, jobs=self._jobs)
-        if path:
-            with atomic_write(path, "cache") as part:
-                part.write_bytes(npy_bytes(features))
+        shape = len(self.patches) * (1 + mirror), params.length
+        if features is None or features.shape != shape or features.dtype != np.float32:
+            features = patch_features(self.patches, params, TrainingOptions(mirror=mirror), jobs=self._jobs)
+            if path:
+                content = io.BytesIO()  # unlike `numpy.save`, writing it names the error of a full disk
+                np.save(content, features, allow_pickle=False)
+                with atomic_write(path, "cache") as part:
+                    part.write_bytes(content.getvalue())
         return features
-
-
-def npy_bytes(array: NDArray[np.float32]) -> bytes:
-    """Content of a ``.npy`` file; unlike `numpy.save`, writing it names the error of a full disk."""
-    content = io.BytesIO()
-    np.save(content, array, allow_pickle=False)
-    return content.getvalue()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 import textwrap
 import threading
@@ -167,36 +168,33 @@ def train_and_evaluate(
     random_state = check_integer(options.random_state, "random_state", low=0, high=2**32 - seeds)
     splits, skipped = _make_splits(patch_set, split, range(random_state, random_state + seeds))
     inner = _inner_split(patch_set, splits["sequences"][0]) if "sequences" in splits else None
+    fits = [("final", None), *((name, part) for name, listed in splits.items() for part in listed)]
+    fits += [("calibration", inner)] * (inner is not None)
     seconds: dict[str, float] = {}
-    n_fits = sum(map(len, splits.values())) + (inner is not None) + 1
-    with ThreadPoolExecutor(resolve_jobs(jobs)) as pool, _timed_steps(progress, n_fits, seconds) as step:
+    with ThreadPoolExecutor(resolve_jobs(jobs)) as pool, _timed_steps(progress, len(fits), seconds) as step:
         with step("features", fits=0):
             features = patch_features(patch_set.patches, params, options, jobs=jobs)
 
-        def train(name: str, rows: NDArray[np.intp] | None = None) -> VehicleClassifier:
+        def fit(name: str, part: Split | None) -> Any:
+            """Train on all patches; or on a part of them, and return the scores of the others."""
             with step(name):
-                return fit_features(features, labels, params, options, rows=rows)
+                rows = None if part is None else part.train
+                trained = fit_features(features, labels, params, options, rows=rows)
+            return trained if part is None else trained.decision_function(features[part.test])
 
-        def test_scores(name: str, parts: Split) -> NDArray[np.float64]:
-            return train(name, parts.train).decision_function(features[parts.test])
-
-        final = pool.submit(train, "final")
-        running = {name: [pool.submit(test_scores, name, part) for part in splits[name]] for name in splits}
-        calibration = pool.submit(test_scores, "calibration", inner) if inner is not None else None
-        scores, error = {}, None
+        running = [pool.submit(fit, *each) for each in fits]
         try:
-            for name, listed in splits.items():
-                with step("leakage", fits=0):
-                    leakage = split_leakage(patch_set, listed[0])
-                found = [future.result() for future in running[name]]
-                scores[name] = _score_split(listed, found, labels, leakage)
-            if calibration is not None and inner is not None:
-                platt = calibrate_scores(calibration.result(), labels[inner.test])
-                probability = platt.probability(running["sequences"][0].result())
-                error = calibration_error(probability, labels[splits["sequences"][0].test])
-            classifier = final.result()
+            with step("leakage", fits=0):
+                leakage = {name: split_leakage(patch_set, listed[0]) for name, listed in splits.items()}
+            classifier, *found = (future.result() for future in running)
         finally:
             pool.shutdown(cancel_futures=True)
+    results = iter(found)
+    tested = {name: list(itertools.islice(results, len(listed))) for name, listed in splits.items()}
+    error = None
+    if inner is not None:
+        probability = calibrate_scores(found[-1], labels[inner.test]).probability(tested["sequences"][0])
+        error = calibration_error(probability, labels[splits["sequences"][0].test])
     report = TrainingReport(
         params=params,
         options=options,
@@ -205,7 +203,9 @@ def train_and_evaluate(
         vehicles=int(labels.sum()),
         non_vehicles=int((labels == 0).sum()),
         fingerprint=patch_set.fingerprint,
-        splits=scores,
+        splits={
+            name: _score_split(listed, tested[name], labels, leakage[name]) for name, listed in splits.items()
+        },
         calibration_error=error,
         skipped=skipped,
         seconds=seconds,

@@ -1,4 +1,4 @@
-"""Comparison of configurations on splits.
+"""Comparison of configurations of features and training, on patches, on frames and in time.
 
 Every trial is one row of a table. With a store, each row is on disk as soon as it is measured, so an
 interrupted run continues where it stopped, and a run with more configurations measures only the new ones.
@@ -6,9 +6,15 @@ interrupted run continues where it stopped, and a run with more configurations m
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import itertools
+import logging
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,27 +25,88 @@ from vehicle_detection._common import (
     check_integer,
     check_number,
     check_sequence,
+    check_type,
     describe,
     is_listing,
     progress_bar,
 )
 from vehicle_detection.datasets import SEEDED_SPLITS, SPLIT_NAMES, PatchSet, Split, make_split
+from vehicle_detection.detector import Detector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.training.classifier import DEFAULT_C
-from vehicle_detection.training.results import RowStore
-from vehicle_detection.training.trials import (
-    COLUMNS,
-    Configuration,
-    TrialOptions,
-    Trials,
-    read_configurations,
+from vehicle_detection.evaluation import LabelledFrames, best_f1, evaluate_detections, precision_recall_curve
+from vehicle_detection.features import FeatureParams
+from vehicle_detection.regions import RegionParams
+from vehicle_detection.search import SearchParams
+from vehicle_detection.svm import VehicleClassifier
+from vehicle_detection.tables import TrackTable
+from vehicle_detection.training.classifier import (
+    DEFAULT_C,
+    TrainingOptions,
+    check_labels,
+    fit_features,
+    train_classifier,
 )
+from vehicle_detection.training.feature_cache import FeatureCache, digest_of
+from vehicle_detection.training.results import RowStore, make_table
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+_FEATURES = tuple(field.name for field in dataclasses.fields(FeatureParams))
+_TRAINING: dict[str, Any] = {"C": DEFAULT_C, "mirror": True, "positive_weight": 1.0}
+_FIELDS = (*_FEATURES, *_TRAINING)
+_FRAME_METRICS = ("frame_f1", "frame_best_f1", "frame_average_precision", "frame_iou")
+
+COLUMNS = (
+    "status", "message", "configuration", *_FEATURES, "n_features", *_TRAINING, "split", "seed",
+    "train_size", "test_size", "train_accuracy", "accuracy", *_FRAME_METRICS, "frame_f1_by_set", "search_ms",
+    "fit_seconds", "trial",
+)  # fmt: skip
+"""Columns of a row; `compare_configurations` documents them."""
+
+_TIMED_SHAPE, _TIMED_RUNS = (720, 1280), 15
+_MAX_COMBINATIONS = 100_000
 # Patches in the first round of successive halving: with fewer, scores are too noisy to rank candidates.
 _MIN_PATCHES = 300
+_BOOLEANS = {"true": True, "yes": True, "false": False, "no": False}
+
+_LOGGER = logging.getLogger(__name__)
+
+Configuration = FeatureParams | Mapping[str, Any] | str
+"""`FeatureParams`, a preset's name, or a mapping of fields of `FeatureParams` and of training options."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrialOptions:
+    """What each trial measures besides the accuracy on patches, and its resources.
+
+    >>> TrialOptions(time_search=False).frame_sets
+    ()
+    """
+
+    #: Sets of labelled frames of different names, on which classifiers are evaluated without tracking.
+    frames: LabelledFrames | Sequence[LabelledFrames] | None = None
+    search_params: SearchParams = dataclasses.field(default_factory=SearchParams.preset)
+    region_params: RegionParams = dataclasses.field(default_factory=RegionParams)
+    #: Measure the time of the fast search of a 1280x720 frame with `search_params` on one core.
+    time_search: bool = True
+    #: Folder that keeps features between runs, or a `FeatureCache` of the same patches.
+    cache: FeatureCache | str | os.PathLike[str] | None = None
+    jobs: int | None = None  #: threads of the feature extraction
+
+    def __post_init__(self) -> None:
+        for each in self.frame_sets:
+            if not isinstance(each, LabelledFrames):
+                raise InvalidInputError(f"frames must be LabelledFrames, one or more; got {describe(each)}")
+        if len({each.name for each in self.frame_sets}) < len(self.frame_sets):
+            raise InvalidInputError("frames must have different names; pass name=")
+
+    @property
+    def frame_sets(self) -> tuple[LabelledFrames, ...]:
+        """The sets of `frames` as a tuple."""
+        if self.frames is None or isinstance(self.frames, LabelledFrames):
+            return () if self.frames is None else (self.frames,)
+        return check_sequence(self.frames, "frames", "LabelledFrames")
 
 
 def compare_configurations(
@@ -104,20 +171,25 @@ def compare_configurations(
     for value in values:
         check_number(value, "C")
     candidates = read_configurations(configurations, values)
-    parts = list(make_splits(patch_set, splits, check_seeds(seeds)))
-    trials = Trials(patch_set, options, RowStore(store, COLUMNS))
-    # Candidates with the same features follow each other, so that a small cache computes them once.
-    order = {name: place for place, name in enumerate(dict.fromkeys(each.name for each in candidates))}
-    candidates.sort(key=lambda candidate: order[candidate.name])
-    total = sum(1 if candidate.error else len(parts) for candidate in candidates)
-    with progress_bar(progress, total, unit="trial") as trials.bar:
-        for candidate in candidates:
-            if candidate.error:
-                trials.add_impossible(candidate)
-                continue
-            for name, seed, split in parts:
-                trials.run(candidate, split, seed, split_name=name)
-    return trials.table()
+    parts = list(_make_splits(patch_set, splits, _check_seeds(seeds)))
+    trials, stored, rows = Trials(patch_set, options), RowStore(store, COLUMNS), []
+    # Candidates with the same features follow each other: the cache computes them once.
+    names = {name: place for place, name in enumerate(dict.fromkeys(each.name for each in candidates))}
+    candidates.sort(key=lambda candidate: names[candidate.name])
+    plan = [(each, part) for each in candidates for part in ([(None, None, None)] if each.error else parts)]
+    with progress_bar(progress, len(plan), unit="trial") as bar:
+        for candidate, (name, seed, split) in plan:
+            trial = trials.digest(candidate, split, seed)
+            row = stored.get(trial) or {**candidate.columns, **trials.measure(candidate, split, seed)}
+            row |= {"configuration": candidate.name, "split": name, "seed": seed, "trial": trial}
+            rows.append({column: row.get(column) for column in COLUMNS})
+            bar.update()
+            if trial not in stored:
+                stored.add(rows[-1])
+                level = logging.WARNING if row.get("accuracy") is None else logging.INFO
+                outcome = row.get("message") or row["accuracy"]
+                _LOGGER.log(level, "%s, C=%s: %s: %s", candidate.name, row["C"], row["status"], outcome)
+    return make_table(rows, COLUMNS)
 
 
 def halve_configurations(
@@ -127,7 +199,6 @@ def halve_configurations(
     *,
     split: str = "sequences",
     random_state: int = 0,
-    options: TrialOptions | None = None,
 ) -> list[dict[str, Any]]:
     """Select the `count` best configurations by successive halving, best first.
 
@@ -138,20 +209,20 @@ def halve_configurations(
     from sklearn.experimental import enable_halving_search_cv  # noqa: F401 - enables the next import
     from sklearn.model_selection import HalvingGridSearchCV
 
-    trials = Trials(patch_set, options, RowStore(None, COLUMNS))
-
     class Trial(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
-        """An estimator over row numbers."""
+        """A candidate as an estimator of patches."""
 
         def __init__(self, candidate: Any = None) -> None:
             self.candidate = candidate
 
-        def fit(self, X: NDArray[np.intp], y: NDArray[np.int64]) -> Trial:
-            self.classes_, self.model_ = np.unique(y), trials.train(self.candidate, X[:, 0], random_state)
+        def fit(self, X: NDArray[np.uint8], y: NDArray[np.int64]) -> Trial:
+            options = dataclasses.replace(self.candidate.training, random_state=random_state)
+            self.classes_ = np.unique(y)
+            self.model_ = train_classifier(X, y, params=self.candidate.params, options=options)
             return self
 
-        def score(self, X: NDArray[np.intp], y: NDArray[np.int64]) -> float:
-            return self.model_.score(trials.cache.rows(self.model_.params, X[:, 0]), y)
+        def score(self, X: NDArray[np.uint8], y: NDArray[np.int64]) -> float:
+            return self.model_.score(X, y)
 
     possible = [each for each in dict.fromkeys(read_configurations(configurations)) if not each.error]
     if len(possible) <= count:
@@ -166,13 +237,150 @@ def halve_configurations(
         refit=False,
         random_state=random_state,
     )
-    results = search.fit(np.arange(n_patches)[:, None], trials.labels).cv_results_
+    results = search.fit(patch_set.patches, patch_set.labels.astype(np.int64)).cv_results_
     order = np.lexsort((-results["mean_test_score"], -results["iter"]))
     best = dict.fromkeys(results["params"][row]["candidate"] for row in order)
     return [each.options for each in best][:count]
 
 
-def make_splits(
+def expand_grid(grid: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
+    """List all combinations of a grid's values; the last name varies fastest.
+
+    >>> expand_grid({"orient": [8, 9], "C": [1e-4]})
+    [{'orient': 8, 'C': 0.0001}, {'orient': 9, 'C': 0.0001}]
+    """
+    given: object = grid
+    if not isinstance(given, Mapping) or not given:
+        raise InvalidInputError(
+            f"grid must map option names ({', '.join(_FIELDS)}) to lists of values; got {describe(given)}"
+        )
+    _check_names(grid, "grid")
+    lists = [list(values) if is_listing(values) else [] for values in grid.values()]
+    for name, values in zip(grid, lists):
+        if not values:
+            given = describe(grid[name])
+            raise InvalidInputError(f"grid[{name!r}] must be a list of values, one or more; got {given}")
+    count = math.prod(map(len, lists))
+    if count > _MAX_COMBINATIONS:
+        raise InvalidInputError(f"grid must have at most {_MAX_COMBINATIONS} combinations; got {count}")
+    return [dict(zip(grid, values)) for values in itertools.product(*lists)]
+
+
+def parse_grid(text: str) -> dict[str, list[Any]]:
+    """Parse a grid from the command line.
+
+    >>> parse_grid("orient=8,9 hog_channel=ALL,0 C=1e-4")
+    {'orient': [8, 9], 'hog_channel': ['ALL', 0], 'C': [0.0001]}
+    """
+    grid: dict[str, list[Any]] = {}
+    for part in text.split():
+        name, sign, values = part.partition("=")
+        if not sign or not name or not all(values.split(",")):
+            raise InvalidInputError(
+                "grid must look like 'orient=8,9 color_space=YCrCb,LAB', with commas and no spaces between "
+                f"values; got {part!r}"
+            )
+        if name in grid:
+            raise InvalidInputError(f"grid names {name} twice; put all its values into one list")
+        grid[name] = [_BOOLEANS.get(each.lower(), _number_or_text(each)) for each in values.split(",")]
+    if not grid:
+        raise InvalidInputError("grid is empty; name at least one option, such as 'orient=8,9'")
+    return grid
+
+
+def _number_or_text(text: str) -> int | float | str:
+    """Parse a text as an integer, else as a float, else return it unchanged."""
+    for kind in (int, float):
+        with contextlib.suppress(ValueError):
+            return kind(text)
+    return text
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Features and training options of one classifier; an impossible combination has only an error."""
+
+    name: str = dataclasses.field(compare=False)
+    columns: dict[str, Any] = dataclasses.field(compare=False)  # of a row
+    params: FeatureParams | None = None
+    training: TrainingOptions | None = None
+    error: str | None = None
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The configuration as a mapping."""
+        return {name: value for name, value in self.columns.items() if name != "n_features"}
+
+
+def read_configurations(
+    configurations: Mapping[str, Configuration] | Sequence[Configuration], C: Sequence[float] = (DEFAULT_C,)
+) -> list[Candidate]:
+    """Check each configuration; one that does not set `C` is a candidate with each of these values."""
+    given: object = configurations
+    if isinstance(given, Mapping):
+        pairs: list[tuple[str | None, Any]] = list(given.items())
+    else:
+        pairs = [(None, each) for each in given] if is_listing(given) else []
+    if not pairs:
+        raise InvalidInputError(
+            "configurations must be a mapping from names to FeatureParams or a list of them, with at least "
+            f"one entry; got {describe(given)}"
+        )
+    read = [(name, _read_options(configuration)) for name, configuration in pairs]
+    return [
+        _make_candidate(name, {**_TRAINING, "C": value, **options})
+        for name, options in read
+        for value in (C if "C" not in options else C[:1])
+    ]
+
+
+def _read_options(configuration: object) -> dict[str, Any]:
+    """Options of a configuration in any of its forms."""
+    if isinstance(configuration, str):
+        configuration = FeatureParams.preset(configuration)
+    if isinstance(configuration, FeatureParams):
+        configuration = dataclasses.asdict(configuration)
+    if not isinstance(configuration, Mapping):
+        raise InvalidInputError(
+            "a configuration must be FeatureParams, a mapping of options or a preset's name; "
+            f"got {describe(configuration)}"
+        )
+    _check_names(configuration, "configuration")
+    return dict(configuration)
+
+
+def _check_names(options: Mapping[str, Any], name: str) -> None:
+    unknown = [key for key in options if key not in _FIELDS]
+    if unknown:
+        raise InvalidInputError(f"{name} has the unknown option {unknown[0]!r}; use {', '.join(_FIELDS)}")
+
+
+def _make_candidate(name: str | None, options: Mapping[str, Any]) -> Candidate:
+    features = {key: value for key, value in options.items() if key not in _TRAINING}
+    training = {key: options[key] for key in _TRAINING}
+    try:
+        params, fitting = FeatureParams(**features), TrainingOptions(**training)
+    except InvalidInputError as error:
+        return Candidate(name or _join_options(features), {**features, **training}, error=str(error))
+    columns = {**dataclasses.asdict(params), "n_features": params.length}
+    columns |= {key: getattr(fitting, key) for key in _TRAINING}
+    return Candidate(name or _describe_params(params), columns, params, fitting)
+
+
+def _describe_params(params: FeatureParams) -> str:
+    """Name features by their preset, or else by the fields that differ from the defaults."""
+    for preset in FeatureParams.PRESETS:
+        if FeatureParams.preset(preset) == params:
+            return preset
+    defaults, values = dataclasses.asdict(FeatureParams()), dataclasses.asdict(params)
+    return _join_options({key: value for key, value in values.items() if value != defaults[key]})
+
+
+def _join_options(options: Mapping[str, Any]) -> str:
+    return " ".join(f"{key}={value}" for key, value in options.items()) or "default"
+
+
+def _make_splits(
     patch_set: PatchSet, splits: str | Sequence[str] | Mapping[str, Split], seeds: tuple[int, ...]
 ) -> Iterator[tuple[str, int, Split]]:
     """Name, seed and rows of each split."""
@@ -197,7 +405,7 @@ def make_splits(
             yield name, seed, make_split(patch_set, name, random_state=seed)
 
 
-def check_seeds(seeds: object) -> tuple[int, ...]:
+def _check_seeds(seeds: object) -> tuple[int, ...]:
     """Return the seeds if they are different integers."""
     listed = seeds if is_listing(seeds) else ()
     checked = tuple(check_integer(seed, "seeds", low=0, high=2**32 - 1) for seed in listed)
@@ -206,3 +414,110 @@ def check_seeds(seeds: object) -> tuple[int, ...]:
             f"seeds must be a list of different integers, such as range(5); got {describe(seeds)}"
         )
     return checked
+
+
+class Trials:
+    """Trains and measures candidates on patches."""
+
+    def __init__(self, patch_set: PatchSet, options: TrialOptions | None) -> None:
+        options = TrialOptions() if options is None else options
+        check_type(options, "options", TrialOptions, "omit it for the defaults")
+        check_type(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
+        cache = options.cache
+        if not isinstance(cache, FeatureCache):
+            cache = FeatureCache(patch_set.patches, folder=cache, jobs=options.jobs)
+        elif cache.patches is not patch_set.patches:
+            raise InvalidInputError(
+                "cache must be a FeatureCache of the patches of patch_set; make one from patch_set.patches"
+            )
+        self._cache, self._options = cache, options
+        self._labels = patch_set.labels.astype(np.int64)
+        self._search_ms: dict[FeatureParams, float] = {}
+        used: dict[str, Any] = {"timed": options.time_search}
+        if options.time_search or options.frame_sets:
+            used["search"] = dataclasses.asdict(options.search_params)
+        if options.frame_sets:
+            used["regions"] = dataclasses.asdict(options.region_params)
+            used["frames"] = [_digest_frames(each) for each in options.frame_sets]
+        self._digest = digest_of(cache.digest, self._labels, used)
+
+    def digest(self, candidate: Candidate, split: Split | None, seed: int | None) -> str:
+        """Hash of all that a trial depends on, but for the pixels of frames, the version and the machine."""
+        return digest_of(self._digest, candidate.columns, *(split or ()), seed)
+
+    def measure(self, candidate: Candidate, split: Split, seed: int) -> dict[str, Any]:
+        """Train and measure; the columns that a measurement fills."""
+        if candidate.error:
+            return {"status": "failed", "message": candidate.error}
+        options, row = self._options, {"train_size": len(split.train), "test_size": len(split.test)}
+        start = time.perf_counter()
+        try:
+            classifier = self.train(candidate, split.train, seed)
+        except InvalidInputError as error:
+            return {"status": "failed", "message": str(error), **row}
+        measured = {"fit_seconds": round(time.perf_counter() - start, 3)}
+        features = self._features(candidate)
+        for name, rows in (("train_accuracy", split.train), ("accuracy", split.test)):
+            measured[name] = classifier.score(features[rows], self._labels[rows])
+        if options.frame_sets or options.time_search:
+            try:
+                classifier.open_search(jobs=1).close()
+            except InvalidInputError as error:
+                return {"status": "partial", "message": str(error), **row, **measured}
+            if options.time_search:
+                measured["search_ms"] = self._time_search(classifier)
+            if options.frame_sets:
+                measured |= self._score_frames(classifier)
+        return {"status": "ok", **row, **measured}
+
+    def train(self, candidate: Candidate, rows: NDArray[np.intp], seed: int) -> VehicleClassifier:
+        """Train on some of the patches; equal to `train_classifier` on them."""
+        assert candidate.params is not None
+        assert candidate.training is not None
+        check_labels(self._labels[rows], len(rows))
+        options = dataclasses.replace(candidate.training, random_state=seed)
+        return fit_features(self._features(candidate), self._labels, candidate.params, options, rows=rows)
+
+    def _features(self, candidate: Candidate) -> NDArray[np.float32]:
+        return self._cache.features(candidate.params, mirror=candidate.columns["mirror"])
+
+    def _score_frames(self, classifier: VehicleClassifier) -> dict[str, Any]:
+        """Mean of each metric over the sets of frames, and the F1 score of each set as text."""
+        import pandas as pd
+
+        scores = {each.name: self._score_set(classifier, each) for each in self._options.frame_sets}
+        # The mean of a metric without any value is NaN.
+        means = pd.DataFrame(scores, _FRAME_METRICS).mean(axis=1)
+        by_set = "; ".join(f"{name} {f1:.4f}" for name, (f1, *_) in scores.items())
+        return {**means, "frame_f1_by_set": by_set}
+
+    def _score_set(self, classifier: VehicleClassifier, frames: LabelledFrames) -> tuple[float, ...]:
+        """Values of `_FRAME_METRICS` on a set of frames."""
+        search = self._options.search_params.with_horizon(frames.horizon)
+        regions = self._options.region_params
+        with Detector(classifier, search_params=search, region_params=regions) as detector:
+            found = TrackTable.from_detections({key: detector.detect(image) for key, image in frames})
+        scores = evaluate_detections(found, frames.labels, frames=frames.keys)
+        best, _ = best_f1(*precision_recall_curve(found, frames.labels))
+        return scores.f1, best, scores.average_precision, scores.mean_iou
+
+    def _time_search(self, classifier: VehicleClassifier) -> float:
+        """Milliseconds of the fast search of a 1280x720 frame on one core: the fastest of several runs."""
+        if classifier.params not in self._search_ms:
+            frame = np.random.default_rng(0).integers(0, 256, (*_TIMED_SHAPE, 3), np.uint8)
+            seconds = []
+            with contextlib.closing(classifier.open_search(jobs=1)) as search:
+                # The first run compiles kernels and allocates buffers.
+                for _ in range(_TIMED_RUNS + 1):
+                    start = time.perf_counter()
+                    search.find(frame, self._options.search_params)
+                    seconds.append(time.perf_counter() - start)
+            self._search_ms[classifier.params] = round(min(seconds[1:]) * 1000, 3)
+        return self._search_ms[classifier.params]
+
+
+def _digest_frames(frames: LabelledFrames) -> str:
+    """Hash of a set's name, frame keys and labels; hashing the images would take too long."""
+    labels = frames.labels
+    keys = [list(map(str, frames.keys)), list(map(str, labels["frame"])), frames.horizon]
+    return digest_of(frames.name, keys, labels.boxes, labels["ignore"], labels["track_id"])
