@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate, groupby, pairwise
+from itertools import accumulate, pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_flags, check_number
+from vehicle_detection._common import Floats, check_flags, check_number
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.detections import Scores, format_number, format_summary, mean, rates, ratio
-from vehicle_detection.evaluation.hota import Overlaps, hota_scores
 from vehicle_detection.evaluation.matching import find_ignored, prepare_evaluation
 from vehicle_detection.tables import NO_TRACK, FrameKey, TrackTable
+
+# Minimum IoU of a match in HOTA; each of its scores is the mean over these thresholds.
+_ALPHAS = np.arange(0.05, 0.99, 0.05)
+_EPS = np.finfo(np.float64).eps
+
+Ids = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -109,61 +116,44 @@ def evaluate_tracks(
     min_iou = check_number(iou, "iou", above=0, high=1)
     _check_tracks(predictions, "predictions", keys)
     _check_tracks(labels, "labels", keys)
-    matched = _match_tracks(predictions, labels, keys, min_iou, ignored_as_regions)
+    clip = _match_tracks(predictions, labels, keys, min_iou, ignored_as_regions)
+    places = dict(zip(keys, _positions(keys)))
 
-    overlaps = [overlap for frame in matched for *_, overlap in frame.pairs]
-    found_rows = [row for frame in matched for _, row, _ in frame.pairs]
-    false_rows = [row for frame in matched for row in frame.false]
-    tp, fp, fn = len(found_rows), len(false_rows), sum(len(frame.missed) for frame in matched)
-    # The tracks that matched each vehicle, frame by frame; None where it was missed.
-    histories: dict[int, list[int | None]] = defaultdict(list)
-    for frame in matched:
-        for target, row, _ in frame.pairs:
-            histories[int(labels["track_id"][target])].append(int(predictions["track_id"][row]))
-        for target in frame.missed:
-            histories[int(labels["track_id"][target])].append(None)
-    switches = fragmentations = 0
-    for history in histories.values():
-        tracks = [track for track in history if track is not None]
-        switches += sum(before != after for before, after in pairwise(tracks))
-        found_runs = sum(found for found, _ in groupby(track is not None for track in history))
-        fragmentations += max(found_runs - 1, 0)
+    def place(side: TrackTable, rows: Ids) -> tuple[Ids, Ids]:
+        """Track and position of each row."""
+        positions = [places[key] for key in side["frame"][rows].tolist()]
+        return side["track_id"][rows], np.array(positions, np.int64)
+
+    # The labels that count, and the prediction that matches each of them, vehicle by vehicle.
+    targets, matched = (_join([getattr(each, name) for each in clip]) for name in ("targets", "matched"))
+    order = np.lexsort(place(labels, targets)[::-1])
+    targets, matched, found = targets[order], matched[order], matched[order] >= 0
+    vehicle, position = place(labels, targets)
+    same, both = vehicle[1:] == vehicle[:-1], found[1:] & found[:-1]
+    errors = predictions.boxes[matched] - labels.boxes[targets] if len(predictions) else np.empty((0, 4))
+    steady = np.flatnonzero(same & both & (np.diff(position) == 1))
+    tracks = np.stack([vehicle[found], predictions["track_id"][matched[found]]])
+    switches = int(((np.diff(tracks[0]) == 0) & (np.diff(tracks[1]) != 0)).sum())
+    runs = int(found.sum()) - int((same & both).sum())  # in which a vehicle is matched frame by frame
+    false = _join([each.false for each in clip])
+    tp, fp, fn = int(found.sum()), len(false), int((~found).sum())
+    pairs = _join_pairs(predictions, labels, clip)
     return TrackScores(
         frames=len(keys),
         iou=min_iou,
-        vehicles=len(histories),
-        tracks=len(np.unique(predictions["track_id"][found_rows + false_rows])),
-        ignored=sum(frame.ignored for frame in matched),
-        mean_iou=mean(overlaps),
-        jitter=_jitter(predictions, labels, matched),
+        vehicles=len(np.unique(vehicle)),
+        tracks=len(np.unique(predictions["track_id"][_join([matched[found], false])])),
+        ignored=sum(each.ignored for each in clip),
+        mean_iou=mean(np.concatenate([each.overlaps for each in clip] or [[]])),
+        jitter=mean(np.abs(errors[steady + 1] - errors[steady])),
         mota=1 - ratio(fn + fp + switches, tp + fn),
-        **hota_scores([_overlaps(predictions, labels, frame) for frame in matched]),
-        idf1=ratio(2 * _identity_true_positives(matched), 2 * tp + fp + fn),
+        **_hota_scores(pairs, clip),
+        idf1=ratio(2 * _identity_true_positives(pairs, min_iou), 2 * tp + fp + fn),
         id_switches=switches,
-        fragmentations=fragmentations,
-        longest_false_positive_run=_longest_false_run(predictions, matched),
+        fragmentations=runs - len(np.unique(vehicle[found])),
+        longest_false_positive_run=_longest_run(*place(predictions, false)),
         **rates(tp, fp, fn),
     )
-
-
-@dataclass(frozen=True)
-class _MatchedFrame:
-    """The matches of one frame, as row numbers of `labels` and `predictions`."""
-
-    position: int  # consecutive frames differ by 1, others by more
-    pairs: list[tuple[int, int, float]]  # label row, prediction row, IoU
-    missed: list[int]  # label rows
-    false: list[int]  # prediction rows
-    ignored: int
-    overlapping: list[tuple[int, int]]  # vehicle and track of every pair that overlaps enough, matched or not
-
-
-def _overlaps(predictions: TrackTable, labels: TrackTable, frame: _MatchedFrame) -> Overlaps:
-    """Collect the boxes of a frame that count."""
-    targets = np.array(sorted([*(target for target, *_ in frame.pairs), *frame.missed]), np.intp)
-    rows = np.array(sorted([*(row for _, row, _ in frame.pairs), *frame.false]), np.intp)
-    iou = iou_matrix(labels.boxes[targets], predictions.boxes[rows])
-    return Overlaps(labels["track_id"][targets], predictions["track_id"][rows], iou)
 
 
 def _check_tracks(side: TrackTable, name: str, keys: list[FrameKey]) -> None:
@@ -177,46 +167,46 @@ def _check_tracks(side: TrackTable, name: str, keys: list[FrameKey]) -> None:
             )
 
 
+class _Frame(NamedTuple):
+    """The matches of one frame."""
+
+    targets: Ids  # (N,) rows of the labels that count
+    rows: Ids  # (M,) rows of the predictions that are not ignored
+    iou: Floats  # (N, M)
+    matched: Ids  # (N,) row of the prediction that matches each label, or -1
+    false: Ids  # rows of the predictions without a label
+    overlaps: Floats  # IoU of each match
+    ignored: int
+
+
 def _match_tracks(
-    predictions: TrackTable,
-    labels: TrackTable,
-    keys: list[FrameKey],
-    min_iou: float,
-    ignored_as_regions: bool,
-) -> list[_MatchedFrame]:
+    predictions: TrackTable, labels: TrackTable, keys: list[FrameKey], min_iou: float, as_regions: bool
+) -> list[_Frame]:
     """Match the frames in order, each vehicle with its last track where possible."""
     track_of: dict[int, int] = {}
-    matched: list[_MatchedFrame] = []
-    for key, position in zip(keys, _positions(keys)):
+    clip = []
+    for key in keys:
         here, rows = predictions.rows(key), labels.rows(key)
         targets = rows[~labels["ignore"][rows]]
         overlap = iou_matrix(labels.boxes[targets], predictions.boxes[here])
         vehicles, tracks = labels["track_id"][targets].tolist(), predictions["track_id"][here].tolist()
-
-        kept: list[tuple[int, int]] = []
+        pairs: dict[int, int] = {}
         for i, vehicle in enumerate(vehicles):
             j = tracks.index(track_of[vehicle]) if track_of.get(vehicle) in tracks else -1
             # If two vehicles had the same track last, the first row takes it, as in motmetrics.
-            if j >= 0 and overlap[i, j] >= min_iou and all(j != taken for _, taken in kept):
-                kept.append((i, j))
-        pairs = kept + _assign_rest(overlap, kept, min_iou)
-        track_of.update((vehicles[i], tracks[j]) for i, j in pairs)
-
-        rest = np.delete(here, [j for _, j in pairs])
-        ignored = find_ignored(predictions.boxes[rest], labels, rows, min_iou, as_regions=ignored_as_regions)
-        dropped = set(rest[ignored].tolist())
-        close = np.argwhere(overlap >= min_iou)
-        matched.append(
-            _MatchedFrame(
-                position,
-                [(int(targets[i]), int(here[j]), float(overlap[i, j])) for i, j in pairs],
-                np.delete(targets, [i for i, _ in pairs]).tolist(),
-                rest[~ignored].tolist(),
-                len(dropped),
-                [(vehicles[i], tracks[j]) for i, j in close if here[j] not in dropped],
-            )
-        )
-    return matched
+            if j >= 0 and overlap[i, j] >= min_iou and j not in pairs.values():
+                pairs[i] = j
+        pairs |= _assign_rest(overlap, pairs, min_iou)
+        track_of.update((vehicles[i], tracks[j]) for i, j in pairs.items())
+        i, j = list(pairs), list(pairs.values())
+        matched = np.full(len(targets), -1)
+        matched[i] = here[j]
+        rest = np.setdiff1d(here, matched)
+        ignored = find_ignored(predictions.boxes[rest], labels, rows, min_iou, as_regions=as_regions)
+        kept = ~np.isin(here, rest[ignored])
+        parts = overlap[:, kept], matched, rest[~ignored], overlap[i, j]
+        clip.append(_Frame(targets, here[kept], *parts, int(ignored.sum())))
+    return clip
 
 
 def _positions(keys: list[FrameKey]) -> list[int]:
@@ -227,72 +217,101 @@ def _positions(keys: list[FrameKey]) -> list[int]:
     return list(accumulate((1 if step == min_step else 2 for step in steps), initial=0))
 
 
-def _assign_rest(
-    overlap: NDArray[np.float64], kept: list[tuple[int, int]], min_iou: float
-) -> list[tuple[int, int]]:
+def _assign_rest(overlap: Floats, kept: dict[int, int], min_iou: float) -> dict[int, int]:
     """Assign the remaining rows: as many pairs as possible, then the largest total IoU."""
     from scipy.optimize import linear_sum_assignment
 
     allowed = overlap >= min_iou
-    for i, j in kept:
-        allowed[i], allowed[:, j] = False, False
+    allowed[list(kept)] = allowed[:, list(kept.values())] = False
     # A forbidden pair costs more than all allowed pairs together.
     chosen = linear_sum_assignment(np.where(allowed, 1 - overlap, 1.0 + min(overlap.shape)))
-    return [(int(i), int(j)) for i, j in zip(*chosen) if allowed[i, j]]
+    return {int(i): int(j) for i, j in zip(*chosen) if allowed[i, j]}
 
 
-def _identity_true_positives(matched: list[_MatchedFrame]) -> int:
-    """Count the right boxes under the best one-to-one assignment of tracks to vehicles (IDTP).
+def _join(arrays: Sequence[Ids]) -> Ids:
+    return np.concatenate([np.empty(0, np.int64), *arrays])
 
-    Vehicles and tracks that overlap in no frame, directly or through others, are assigned separately: a table
-    of all of them grows with the square of the clip's length.
+
+def _longest_run(tracks: Ids, positions: Ids) -> int:
+    """Most consecutive positions of one track."""
+    order = np.lexsort([positions, tracks])
+    is_gap = (np.diff(tracks[order]) != 0) | (np.diff(positions[order]) != 1)
+    ends = np.array([0, *(np.flatnonzero(is_gap) + 1), len(tracks)])
+    return int(np.diff(ends).max())
+
+
+class _Pairs(NamedTuple):
+    """Each vehicle and track that occur in the same frame, and their IoU there."""
+
+    numbers: Ids  # (K,) number of each pair of a frame, the same in all its frames
+    iou: Floats  # (K,)
+    vehicles: Ids  # (P,) vehicle of each number
+    tracks: Ids  # (P,)
+    boxes: Ids  # (P,) boxes of the vehicle and the track together
+
+
+def _join_pairs(predictions: TrackTable, labels: TrackTable, clip: list[_Frame]) -> _Pairs:
+    sides = [
+        (labels["track_id"][each.targets], predictions["track_id"][each.rows], each.iou.ravel())
+        for each in clip
+    ]
+    boxes = [Counter(_join([each[side] for each in sides]).tolist()) for side in (0, 1)]
+    vehicle = _join([np.repeat(vehicles, len(tracks)) for vehicles, tracks, _ in sides])
+    track = _join([np.tile(tracks, len(vehicles)) for vehicles, tracks, _ in sides])
+    pairs, numbers = np.unique(np.stack([vehicle, track]), axis=1, return_inverse=True)
+    counts = [boxes[0][i] + boxes[1][j] for i, j in pairs.T.tolist()]
+    iou = np.concatenate([np.empty(0), *(each for *_, each in sides)])
+    return _Pairs(numbers.ravel(), iou, *pairs, np.array(counts, np.int64))
+
+
+def _hota_scores(pairs: _Pairs, clip: list[_Frame]) -> dict[str, Any]:
+    """HOTA, DetA, AssA and LocA of a clip, by the names of the fields of `TrackScores`.
+
+    All values equal those of the authors' package TrackEval.
     """
     from scipy.optimize import linear_sum_assignment
+
+    n_boxes = sum(len(each.targets) + len(each.rows) for each in clip)
+    if not n_boxes:
+        return dict.fromkeys(("hota", "deta", "assa", "loca"), math.nan)
+    # Jaccard index of each vehicle and track over the clip, before boxes are matched.
+    parts = [np.empty(0)]
+    for iou in (each.iou for each in clip):
+        union = iou.sum(axis=0) + iou.sum(axis=1)[:, None] - iou
+        parts.append(np.divide(iou, union, out=np.zeros_like(iou), where=union > _EPS).ravel())
+    shared = np.bincount(pairs.numbers, np.concatenate(parts), len(pairs.boxes))
+    weights = (shared / (pairs.boxes - shared))[pairs.numbers] * pairs.iou
+    # Match each frame for the largest total IoU, weighted by this index, whatever the threshold.
+    chosen, start = [np.empty(0, np.intp)], 0
+    for n, m in (each.iou.shape for each in clip):
+        i, j = linear_sum_assignment(weights[start : start + n * m].reshape(n, m), maximize=True)
+        chosen.append(start + i * m + j)
+        start += n * m
+    rows = np.concatenate(chosen)
+    iou, numbers = pairs.iou[rows], pairs.numbers[rows]
+    matched = iou >= _ALPHAS[:, None] - _EPS  # (A, matches)
+    tp = matched.sum(axis=1)
+    detection = tp / (n_boxes - tp)
+    localization = np.maximum((matched * iou).sum(axis=1), 1e-10) / np.maximum(tp, 1e-10)
+    matches = np.array([np.bincount(numbers[each], minlength=len(pairs.boxes)) for each in matched])
+    association = (matches * (matches / (pairs.boxes - matches))).sum(axis=1) / np.maximum(tp, 1)
+    values = np.sqrt(detection * association), detection, association, localization
+    return {name: float(each.mean()) for name, each in zip(("hota", "deta", "assa", "loca"), values)}
+
+
+def _identity_true_positives(pairs: _Pairs, min_iou: float) -> int:
+    """Count the right boxes under the best one-to-one assignment of tracks to vehicles (IDTP)."""
     from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
-    counts = Counter(pair for frame in matched for pair in frame.overlapping)
-    if not counts:
+    counts = np.bincount(pairs.numbers[pairs.iou >= min_iou], minlength=len(pairs.boxes))
+    rows, columns = (np.unique(each[counts > 0], return_inverse=True)[1] for each in pairs[2:4])
+    if not len(rows):
         return 0
-    pairs, boxes = np.array([*counts], np.int64), np.array([*counts.values()], np.int64)
-    vehicles, rows = np.unique(pairs[:, 0], return_inverse=True)
-    tracks, columns = np.unique(pairs[:, 1], return_inverse=True)
-    size = len(vehicles) + len(tracks)
-    graph = coo_array((boxes, (rows, columns + len(vehicles))), shape=(size, size))
-    _, groups = connected_components(graph, directed=False)
-    order = np.argsort(groups[rows], kind="stable")
-    total = 0
-    for group in np.split(order, np.flatnonzero(np.diff(groups[rows][order])) + 1):
-        (_, i), (_, j) = (np.unique(each[group], return_inverse=True) for each in (rows, columns))
-        table = np.zeros((i.max() + 1, j.max() + 1), np.int64)
-        table[i, j] = boxes[group]
-        total += int(table[linear_sum_assignment(table, maximize=True)].sum())
-    return total
-
-
-def _jitter(predictions: TrackTable, labels: TrackTable, matched: list[_MatchedFrame]) -> float:
-    """Mean absolute change of the edge errors, over vehicles that are matched in two consecutive frames.
-
-    Errors are followed by vehicle, so the jump to another track's box counts as jitter.
-    """
-    changes: list[NDArray[np.float64]] = []
-    before: dict[int, tuple[int, NDArray[np.float64]]] = {}
-    for frame in matched:
-        for target, row, _ in frame.pairs:
-            vehicle, error = int(labels["track_id"][target]), predictions.boxes[row] - labels.boxes[target]
-            position, last = before.get(vehicle, (-2, error))
-            if position == frame.position - 1:
-                changes.append(np.abs(error - last))
-            before[vehicle] = frame.position, error
-    return mean(changes)
-
-
-def _longest_false_run(predictions: TrackTable, matched: list[_MatchedFrame]) -> int:
-    longest = 0
-    runs: dict[int, tuple[int, int]] = {}
-    for frame in matched:
-        for track in predictions["track_id"][frame.false].tolist():
-            position, length = runs.get(track, (-2, 0))
-            runs[track] = frame.position, length + 1 if position == frame.position - 1 else 1
-            longest = max(longest, runs[track][1])
-    return longest
+    # Each vehicle also has a column of its own, for no track. All weigh 1 more, as 0 is no pair.
+    size = int(rows.max()) + 1
+    own = np.arange(size)
+    weights = np.concatenate([counts[counts > 0] + 1, np.ones(size, np.int64)])
+    places = np.concatenate([rows, own]), np.concatenate([columns, columns.max() + 1 + own])
+    table = coo_array((weights, places)).tocsr()
+    return int(table[min_weight_full_bipartite_matching(table, maximize=True)].sum()) - size
