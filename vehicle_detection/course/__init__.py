@@ -16,72 +16,17 @@ imports are here as well: ``np``, ``cv2``, ``mpimg`` and ``hog``. The page ``doc
 differences from the lesson and counterparts in the main API.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import cv2
+import cv2 as cv2
+import lazy_loader
 import numpy as np
 
-from vehicle_detection.course.detector import HeatmapDetector, process_image
-from vehicle_detection.course.features import (
-    bin_spatial,
-    color_hist,
-    convert_color,
-    extract_features,
-    extract_features_all,
-    get_hog_features,
-    single_img_features,
-)
-from vehicle_detection.course.search import find_car_windows, find_cars, search_windows
-from vehicle_detection.course.smoothing import Box, BoxSmoother, adjust_bbox
-from vehicle_detection.course.versions import detect_versions, set_lesson_defaults
-from vehicle_detection.course.windows import (
-    add_heat,
-    apply_threshold,
-    bounding_boxes,
-    draw_boxes,
-    draw_labeled_bboxes,
-    show_images,
-    slide_window,
-)
-
-if TYPE_CHECKING:
-    from matplotlib import image as mpimg
-    from skimage.feature import hog
-
-__all__ = [
-    "Box",
-    "BoxSmoother",
-    "HeatmapDetector",
-    "add_heat",
-    "adjust_bbox",
-    "apply_threshold",
-    "bin_spatial",
-    "bounding_boxes",
-    "color_hist",
-    "convert_color",
-    "cv2",
-    "detect_versions",
-    "draw_boxes",
-    "draw_labeled_bboxes",
-    "extract_features",
-    "extract_features_all",
-    "find_car_windows",
-    "find_cars",
-    "get_hog_features",
-    "hog",
-    "mpimg",
-    "np",
-    "process_image",
-    "search_windows",
-    "set_lesson_defaults",
-    "show_images",
-    "single_img_features",
-    "slide_window",
-]
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [*__all__, "cv2", "hog", "mpimg", "np"]
 
 
 def __getattr__(name: str) -> Any:
-    # Imported when they are used, because that takes long.
     if name == "mpimg":
         from matplotlib import image
 
@@ -90,4 +35,4 @@ def __getattr__(name: str) -> Any:
         from skimage.feature import hog
 
         return hog
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return _load(name)

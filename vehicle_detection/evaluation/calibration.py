@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_array, check_bool, check_integer, describe
-from vehicle_detection.boxes import Platt
+from vehicle_detection.boxes import Platt as Platt  # its result
 from vehicle_detection.errors import InvalidInputError
 
 
