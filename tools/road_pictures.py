@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -32,7 +33,8 @@ def make_picture(path: Path, *, jobs: int | None = None) -> None:
     images = {name: rendered[key] for name, key in SCENES.items()}
     truth = [scenes.labels.frame(key) for key in SCENES.values()]
     figure = Figure(figsize=(10, 9), layout="constrained")
-    for model, column in zip(("highway", "default"), figure.subfigures(1, 2)):
+    columns: Any = figure.subfigures(1, 2)
+    for model, column in zip(("highway", "default"), columns):
         with VehicleDetector(model, jobs=jobs) as detector:
             found = [detector.detect(image) for image in images.values()]
         names = [f"{name}, {model}: {len(boxes)} boxes" for name, boxes in zip(images, found)]

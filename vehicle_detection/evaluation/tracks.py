@@ -144,7 +144,7 @@ def evaluate_tracks(
         vehicles=len(np.unique(vehicle)),
         tracks=len(np.unique(predictions["track_id"][_join([matched[found], false])])),
         ignored=sum(each.ignored for each in clip),
-        mean_iou=mean(np.concatenate([each.overlaps for each in clip] or [[]])),
+        mean_iou=mean([overlap for each in clip for overlap in each.overlaps.tolist()]),
         jitter=mean(np.abs(errors[steady + 1] - errors[steady])),
         mota=1 - ratio(fn + fp + switches, tp + fn),
         **_hota_scores(pairs, clip),
@@ -198,13 +198,12 @@ def _match_tracks(
                 pairs[i] = j
         pairs |= _assign_rest(overlap, pairs, min_iou)
         track_of.update((vehicles[i], tracks[j]) for i, j in pairs.items())
-        i, j = list(pairs), list(pairs.values())
-        matched = np.full(len(targets), -1)
-        matched[i] = here[j]
+        matched, found, by = np.full(len(targets), -1), list(pairs), list(pairs.values())
+        matched[found] = here[by]
         rest = np.setdiff1d(here, matched)
         ignored = find_ignored(predictions.boxes[rest], labels, rows, min_iou, as_regions=as_regions)
         kept = ~np.isin(here, rest[ignored])
-        parts = overlap[:, kept], matched, rest[~ignored], overlap[i, j]
+        parts = overlap[:, kept], matched, rest[~ignored], overlap[found, by]
         clip.append(_Frame(targets, here[kept], *parts, int(ignored.sum())))
     return clip
 
@@ -251,17 +250,15 @@ class _Pairs(NamedTuple):
 
 
 def _join_pairs(predictions: TrackTable, labels: TrackTable, clip: list[_Frame]) -> _Pairs:
-    sides = [
-        (labels["track_id"][each.targets], predictions["track_id"][each.rows], each.iou.ravel())
-        for each in clip
-    ]
-    boxes = [Counter(_join([each[side] for each in sides]).tolist()) for side in (0, 1)]
-    vehicle = _join([np.repeat(vehicles, len(tracks)) for vehicles, tracks, _ in sides])
-    track = _join([np.tile(tracks, len(vehicles)) for vehicles, tracks, _ in sides])
+    vehicles = [labels["track_id"][each.targets] for each in clip]
+    tracks = [predictions["track_id"][each.rows] for each in clip]
+    n_vehicles, n_tracks = (Counter(_join(each).tolist()) for each in (vehicles, tracks))
+    vehicle = _join([np.repeat(ids, len(others)) for ids, others in zip(vehicles, tracks)])
+    track = _join([np.tile(ids, len(others)) for ids, others in zip(tracks, vehicles)])
     pairs, numbers = np.unique(np.stack([vehicle, track]), axis=1, return_inverse=True)
-    counts = [boxes[0][i] + boxes[1][j] for i, j in pairs.T.tolist()]
-    iou = np.concatenate([np.empty(0), *(each for *_, each in sides)])
-    return _Pairs(numbers.ravel(), iou, *pairs, np.array(counts, np.int64))
+    boxes = np.array([n_vehicles[i] + n_tracks[j] for i, j in pairs.T.tolist()], np.int64)
+    iou = np.concatenate([np.empty(0), *(each.iou.ravel() for each in clip)])
+    return _Pairs(numbers.ravel(), iou, pairs[0], pairs[1], boxes)
 
 
 def _hota_scores(pairs: _Pairs, clip: list[_Frame]) -> dict[str, Any]:

@@ -171,7 +171,7 @@ def compare_configurations(
     for value in values:
         check_number(value, "C")
     candidates = read_configurations(configurations, values)
-    parts = list(_make_splits(patch_set, splits, _check_seeds(seeds)))
+    parts: list[tuple[Any, Any, Any]] = list(_make_splits(patch_set, splits, _check_seeds(seeds)))
     trials, stored, rows = Trials(patch_set, options), RowStore(store, COLUMNS), []
     # Candidates with the same features follow each other: the cache computes them once.
     names = {name: place for place, name in enumerate(dict.fromkeys(each.name for each in candidates))}
@@ -180,7 +180,7 @@ def compare_configurations(
     with progress_bar(progress, len(plan), unit="trial") as bar:
         for candidate, (name, seed, split) in plan:
             trial = trials.digest(candidate, split, seed)
-            row = stored.get(trial) or {**candidate.columns, **trials.measure(candidate, split, seed)}
+            row = dict(stored.get(trial) or candidate.columns | trials.measure(candidate, split, seed))
             row |= {"configuration": candidate.name, "split": name, "seed": seed, "trial": trial}
             rows.append({column: row.get(column) for column in COLUMNS})
             bar.update()
@@ -479,6 +479,7 @@ class Trials:
         return fit_features(self._features(candidate), self._labels, candidate.params, options, rows=rows)
 
     def _features(self, candidate: Candidate) -> NDArray[np.float32]:
+        assert candidate.params is not None
         return self._cache.features(candidate.params, mirror=candidate.columns["mirror"])
 
     def _score_frames(self, classifier: VehicleClassifier) -> dict[str, Any]:
