@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from vehicle_detection._common import check_image, check_integer, check_number, describe
+from vehicle_detection._common import check, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.course.methods import FindWindows, read_bands, window_search
 from vehicle_detection.course.smoothing import BoxSmoother
@@ -88,8 +88,8 @@ class HeatmapDetector:
     ) -> None:
         bands = read_bands(scales, y_start_stop)
         self.find_windows: FindWindows = window_search(clf, scaler, method, bands, options)
-        self.threshold = check_number(float(method) if threshold is None else threshold, "threshold", low=0)
-        self.history: deque[NDArray[Any]] = deque(maxlen=check_integer(n_frames, "n_frames", low=1))
+        self.threshold = check.number(float(method) if threshold is None else threshold, "threshold", low=0)
+        self.history: deque[NDArray[Any]] = deque(maxlen=check.integer(n_frames, "n_frames", low=1))
         if smoother is not None and not callable(smoother):
             raise InvalidInputError(f"smoother must be a BoxSmoother or a function; got {describe(smoother)}")
         self.smoother = smoother
@@ -109,7 +109,7 @@ class HeatmapDetector:
 
     def find_cars(self, frame: NDArray[np.uint8]) -> list[Corners]:
         """Find the vehicles of the next frame: pairs of corners."""
-        check_image(frame, "frame")
+        check.image(frame, "frame")
         self.windows = self.find_windows(frame)
         heat = add_heat(np.zeros(frame.shape[:2], np.float32), self.windows)
         if self.history and self.history[-1].shape != heat.shape:

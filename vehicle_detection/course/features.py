@@ -15,19 +15,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection import _kernels as kernels
 from vehicle_detection import features as library
-from vehicle_detection._common import (
-    Checked,
-    check_array,
-    check_choice,
-    check_flags,
-    check_integer,
-    check_type,
-    checked_field,
-    choice,
-    describe,
-    integer,
-    is_listing,
-)
+from vehicle_detection._common import Checked, check, checked_field, choice, describe, integer, is_listing
 from vehicle_detection.course.versions import (
     CHANNEL_ORDERS,
     READERS,
@@ -82,10 +70,10 @@ def check_lesson_image(img: Any, name: str = "img", *, drop_alpha: bool = False)
 
 def check_size(size: Any, name: str) -> tuple[int, int]:
     """Return ``(width, height)`` of a pair or of one number."""
-    pair = (size, size) if check_array(size, name).ndim == 0 else tuple(size)
+    pair = (size, size) if check.array(size, name).ndim == 0 else tuple(size)
     if len(pair) != 2:
         raise InvalidInputError(f"{name} must be (width, height); got {describe(size)}")
-    return check_integer(pair[0], name, low=1), check_integer(pair[1], name, low=1)
+    return check.integer(pair[0], name, low=1), check.integer(pair[1], name, low=1)
 
 
 @lesson_function()
@@ -168,10 +156,10 @@ def get_hog_features(
         raise InvalidInputError(
             f"img must be one (H, W) channel of numbers, got {describe(img)}; pick one with image[..., 0]"
         )
-    check_flags(vis=vis, visualise=visualise, visualize=visualize, feature_vec=feature_vec)
+    check.flags(vis=vis, visualise=visualise, visualize=visualize, feature_vec=feature_vec)
     transform_sqrt = check_switch(transform_sqrt, "transform_sqrt")
     sizes = {"orient": orient, "pix_per_cell": pix_per_cell, "cell_per_block": cell_per_block}
-    orient, pix_per_cell, cell_per_block = (check_integer(size, name, low=1) for name, size in sizes.items())
+    orient, pix_per_cell, cell_per_block = (check.integer(size, name, low=1) for name, size in sizes.items())
     channel = img if img.dtype in (np.uint8, np.float32) else img.astype(np.float64)
     blocks = hog_blocks(channel[..., None], orient, pix_per_cell, cell_per_block, transform_sqrt)[0]
     blocks = np.ascontiguousarray(blocks, np.float32 if channel.dtype == np.float32 else np.float64)
@@ -217,8 +205,8 @@ def bin_spatial(
     """
     one_channel = isinstance(img, np.ndarray) and img.ndim == 2
     image = check_lesson_image(img[..., None].repeat(3, 2) if one_channel else img, drop_alpha=True)
-    check_choice(order, "order", SPATIAL_ORDERS)
-    check_type(color_space, "color_space", str, "pass a name such as 'YCrCb'")
+    check.choice(order, "order", SPATIAL_ORDERS)
+    check.instance(color_space, "color_space", str, "pass a name such as 'YCrCb'")
     if isinstance(size, str) and len(last_size) <= 1:
         color_space, size = size, last_size[0] if last_size else (32, 32)
     elif last_size:
@@ -251,7 +239,7 @@ def color_hist(
     [4, 0, 0, 0, 4, 0, 0, 0, 4, 0, 0, 0]
     """
     image = check_lesson_image(img, drop_alpha=True)
-    check_integer(nbins, "nbins", low=1)
+    check.integer(nbins, "nbins", low=1)
     limits = check_range(bins_range, "bins_range")
     warn_of_first_bin(image, limits)
     return _histogram(image, nbins, limits)
@@ -337,7 +325,7 @@ def single_img_features(
     (8460,)
     """
     options, image = FeatureOptions.of(locals()), check_lesson_image(img, drop_alpha=True)
-    check_flags(vis=vis)
+    check.flags(vis=vis)
     features = options.compute([image])[0].astype(np.float64)
     if not vis:
         return features
@@ -425,10 +413,10 @@ extract_features_all = extract_features
 
 
 def _reader(imread: str | Callable[[str], Image], channel_order: str) -> Callable[[str], Image]:
-    check_choice(channel_order, "channel_order", CHANNEL_ORDERS)
+    check.choice(channel_order, "channel_order", CHANNEL_ORDERS)
     if callable(imread):
         return imread
-    check_choice(imread, "imread", READERS)
+    check.choice(imread, "imread", READERS)
 
     def read(path: str) -> Image:
         image: Image = read_image(path)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_choice, check_integer, check_number, check_sequence, describe
+from vehicle_detection._common import check, describe
 from vehicle_detection.course.search import find_car_windows, scale_values, search_windows
 from vehicle_detection.course.versions import lesson_defaults
 from vehicle_detection.course.windows import Corners, slide_window
@@ -44,7 +44,7 @@ _FROZEN = ("divide_by", "cells_per_step", "transform_sqrt", "hist_range", "spati
 def read_bands(scales: Sequence[Any], rows: Sequence[int]) -> list[_Band]:
     """Scales with their rows and columns, checked."""
     bands, usual = [], (rows, (0, REFERENCE_WIDTH))
-    for each in check_sequence(scales, "scales", "numbers"):
+    for each in check.sequence(scales, "scales", "numbers"):
         scale, *own = each if isinstance(each, tuple) else (each,)
         pairs = [*own, *usual[len(own) :]]
         if len(pairs) > 2 or not all(_is_range(pair) for pair in pairs):
@@ -52,7 +52,7 @@ def read_bands(scales: Sequence[Any], rows: Sequence[int]) -> list[_Band]:
                 "scales must hold numbers, or (scale, (ystart, ystop), (xstart, xstop)) with start < stop; "
                 f"got {describe(each)} and y_start_stop={describe(rows)}"
             )
-        bands.append((check_number(scale, "scales", low=0.25, high=20), pairs[0], pairs[1]))
+        bands.append((check.number(scale, "scales", low=0.25, high=20), pairs[0], pairs[1]))
     if not bands:
         raise InvalidInputError("scales must hold a number at least, such as (1.0, 1.5); got none")
     return bands
@@ -67,7 +67,7 @@ def window_search(
     clf: Any, scaler: Any, method: int, bands: list[_Band], options: dict[str, Any]
 ) -> FindWindows:
     """Return the function of an image that finds the hot windows."""
-    check_choice(method, "method", (1, 2))
+    check.choice(method, "method", (1, 2))
     if isinstance(clf, (str, os.PathLike)):
         clf = load_classifier(clf)
     if isinstance(clf, VehicleClassifier):
@@ -79,7 +79,7 @@ def window_search(
             )
         if method == 1:
             return lambda image: search_library_windows(image, _list_windows(image), clf).boxes
-        params = _search_params(bands, check_integer(step, "cells_per_step", low=1, high=8))
+        params = _search_params(bands, check.integer(step, "cells_per_step", low=1, high=8))
         return lambda image: find_library_windows(image, clf, params).boxes
     if callable(clf) and not hasattr(clf, "predict"):
         return clf  # type: ignore[no-any-return]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_bool, check_integer, check_number, describe
+from vehicle_detection._common import check, describe
 from vehicle_detection.course.windows import Corners, corner_array
 from vehicle_detection.errors import InvalidInputError
 
@@ -29,7 +29,7 @@ class Box:
     """
 
     def __init__(self, n: int = 10) -> None:
-        self.boxes: deque[Floats] = deque(maxlen=check_integer(n, "n", low=1))
+        self.boxes: deque[Floats] = deque(maxlen=check.integer(n, "n", low=1))
 
     def add(self, box: Any) -> Corners:
         """Add the box of another frame, a pair of corners, and return the weighted mean."""
@@ -46,7 +46,7 @@ def adjust_bbox(bbox: Any, previous: Any, weight: float = 0.3) -> Corners:
     ((15, 0), (55, 40))
     """
     new, old = _one_box(bbox, "bbox"), _one_box(previous, "previous")
-    return _corners(old + check_number(weight, "weight", above=0, high=1) * (new - old))
+    return _corners(old + check.number(weight, "weight", above=0, high=1) * (new - old))
 
 
 def _one_box(box: Any, name: str) -> Floats:
@@ -96,9 +96,9 @@ class BoxSmoother:
     def __init__(
         self, *, weight: float = 1.0, hold: int = 0, estimate: bool = False, show_after: int = 1
     ) -> None:
-        self.weight = check_number(weight, "weight", above=0, high=1)
-        self.hold, self.estimate = check_integer(hold, "hold", low=0), check_bool(estimate, "estimate")
-        self.show_after = check_integer(show_after, "show_after", low=1)
+        self.weight = check.number(weight, "weight", above=0, high=1)
+        self.hold, self.estimate = check.integer(hold, "hold", low=0), check.boolean(estimate, "estimate")
+        self.show_after = check.integer(show_after, "show_after", low=1)
         self.vehicles: list[_Vehicle] = []
 
     def __call__(self, boxes: Any) -> list[Corners]:

@@ -17,14 +17,7 @@ from unittest import mock
 import cv2
 import numpy as np
 
-from vehicle_detection._common import (
-    check_array,
-    check_choice,
-    check_flags,
-    check_integer,
-    check_number,
-    describe,
-)
+from vehicle_detection._common import check, describe
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import SPATIAL_ORDERS
 
@@ -46,24 +39,24 @@ def check_range(limits: Any, name: str) -> tuple[float, float] | None:
     """Return the range of a histogram; None stands for the range of the values."""
     if limits is None:
         return None
-    if check_array(limits, name).shape != (2,):
+    if check.array(limits, name).shape != (2,):
         raise InvalidInputError(f"{name} must be (low, high) or None; got {describe(limits)}")
-    low = check_number(limits[0], name)
-    return low, check_number(limits[1], name, above=low)
+    low = check.number(limits[0], name)
+    return low, check.number(limits[1], name, above=low)
 
 
 def check_switch(value: Any, name: str) -> bool:
     """Return a switch as a bool; the lesson's code also passes 0 and 1."""
-    check_flags(**{name: value})
+    check.flags(**{name: value})
     return bool(value)
 
 
 def _one_of(choices: tuple[str, ...]) -> Callable[[Any, str], Any]:
-    def check(value: Any, name: str) -> Any:
-        check_choice(value, name, choices)
+    def checked(value: Any, name: str) -> Any:
+        check.choice(value, name, choices)
         return value
 
-    return check
+    return checked
 
 
 # Check and initial value of each option of `set_lesson_defaults`.
@@ -76,8 +69,8 @@ _OPTIONS: dict[str, tuple[Callable[[Any, str], Any], Any]] = {
     "spatial_order": (_one_of(SPATIAL_ORDERS), "interleaved"),
     "find_cars_returns": (_one_of(RETURNS), "picture"),
     "find_cars_formula": (_one_of(FORMULAS), "old"),
-    "cells_per_step": (lambda value, name: check_integer(value, name, low=1), 2),
-    "divide_by": (lambda value, name: check_number(value, name, above=0), 255),
+    "cells_per_step": (lambda value, name: check.integer(value, name, low=1), 2),
+    "divide_by": (lambda value, name: check.number(value, name, above=0), 255),
 }
 lesson_defaults = {name: value for name, (_, value) in _OPTIONS.items()}
 
@@ -119,7 +112,7 @@ def set_lesson_defaults(**options: Any) -> None:
     >>> set_lesson_defaults(formula="old")
     """
     for name in options:
-        check_choice(name, "a name of an option", tuple(_OPTIONS))
+        check.choice(name, "a name of an option", tuple(_OPTIONS))
     lesson_defaults.update({name: _OPTIONS[name][0](value, name) for name, value in options.items()})
 
 

@@ -10,14 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import heatmap as library
-from vehicle_detection._common import (
-    check_array,
-    check_choice,
-    check_integer,
-    check_number,
-    check_sequence,
-    describe,
-)
+from vehicle_detection._common import check, describe
 from vehicle_detection.course.features import Image, check_lesson_image
 from vehicle_detection.course.versions import FORMULAS, lesson_function
 from vehicle_detection.errors import InvalidInputError
@@ -64,11 +57,11 @@ def slide_window(
     """
     if not isinstance(img, np.ndarray) or img.ndim < 2:
         raise InvalidInputError(f"img must be an image array; got {describe(img)}")
-    check_choice(formula, "formula", FORMULAS)
+    check.choice(formula, "formula", FORMULAS)
     for name, pair in (("xy_window", xy_window), ("xy_overlap", xy_overlap)):
-        if check_array(pair, name).shape != (2,):
+        if check.array(pair, name).shape != (2,):
             raise InvalidInputError(f"{name} must be a pair of numbers; got {describe(pair)}")
-    width, height = (check_integer(_as_whole(side), "xy_window", low=1) for side in xy_window)
+    width, height = (check.integer(_as_whole(side), "xy_window", low=1) for side in xy_window)
     x1, x2 = _check_span(x_start_stop, img.shape[1], "x_start_stop")
     y1, y2 = _check_span(y_start_stop, img.shape[0], "y_start_stop")
     lefts = _window_starts(x1, x2, width, xy_overlap[0], formula)
@@ -83,7 +76,7 @@ def _as_whole(value: Any) -> Any:
 
 def _check_span(limits: Any, size: int, name: str) -> tuple[int, int]:
     """Return the pixel range ``[start, stop]`` with None replaced by the image's border."""
-    pair = [_as_whole(limit) for limit in limits] if check_array(limits, name).shape == (2,) else []
+    pair = [_as_whole(limit) for limit in limits] if check.array(limits, name).shape == (2,) else []
     if not pair or not all(isinstance(limit, (int, np.integer, type(None))) for limit in pair):
         raise InvalidInputError(f"{name} must be [start, stop], whole pixels or None; got {describe(limits)}")
     start = 0 if pair[0] is None else int(pair[0])
@@ -95,7 +88,7 @@ def _check_span(limits: Any, size: int, name: str) -> tuple[int, int]:
 
 def _window_starts(start: int, stop: int, side: int, overlap: float, formula: str) -> range:
     """First pixels of the windows along one axis."""
-    step = int(side * (1 - check_number(overlap, "xy_overlap", low=0)))
+    step = int(side * (1 - check.number(overlap, "xy_overlap", low=0)))
     if step < 1:
         raise InvalidInputError(
             f"xy_overlap must leave a step of 1 pixel or more between windows of {side} pixels; got {overlap}"
@@ -182,11 +175,11 @@ def draw_boxes(img: Image, bboxes: Any, color: Sequence[float] = BLUE, thick: in
     """
     check_lesson_image(img)
     result: Image = np.array(img, order="C")
-    given = check_array(color, "color")
+    given = check.array(color, "color")
     if given.shape not in ((), (3,)) or given.dtype.kind not in "iuf" or not np.isfinite(given).all():
         raise InvalidInputError(f"color must be (red, green, blue); got {describe(color)}")
     values = [float(given), 0.0, 0.0] if given.ndim == 0 else given.astype(float).tolist()
-    check_integer(thick, "thick", low=-1)
+    check.integer(thick, "thick", low=-1)
     draw_corners(result, corner_array(bboxes, "bboxes"), values, thick)
     return result
 
@@ -232,7 +225,7 @@ def labeled_bboxes(labels: Any, shape: tuple[int, ...] | None = None) -> list[Co
             f"labels must be the pair that scipy.ndimage.label returns for a map of {shape or '(H, W)'}; "
             f"got {describe(labels)}"
         )
-    regions = find_objects(array, max_label=check_integer(count, "the number of labels", low=0))
+    regions = find_objects(array, max_label=check.integer(count, "the number of labels", low=0))
     return [((x.start, y.start), (x.stop - 1, y.stop - 1)) for y, x in filter(None, regions)]
 
 
@@ -255,11 +248,11 @@ def show_images(images: Sequence[Image], titles: Sequence[str] = (), columns: in
     """Show images in a grid with matplotlib's pyplot: RGB, or ``(H, W)`` in a color map."""
     import matplotlib.pyplot as plt
 
-    for image in (images := check_sequence(images, "images", "images")):
+    for image in (images := check.sequence(images, "images", "images")):
         if not isinstance(image, np.ndarray) or image.ndim != 2:
             check_lesson_image(image, "each of the images")
-    columns = min(check_integer(columns, "columns", low=1), len(images) or 1)
-    rows, titles = -(-len(images) // columns) or 1, check_sequence(titles, "titles", "texts")
+    columns = min(check.integer(columns, "columns", low=1), len(images) or 1)
+    rows, titles = -(-len(images) // columns) or 1, check.sequence(titles, "titles", "texts")
     panels = plt.subplots(rows, columns, figsize=(6 * columns, 3.6 * rows), squeeze=False)[1].ravel()
     for panel, image in zip(panels, images):
         panel.imshow(image, cmap="hot" if image.ndim == 2 else None)

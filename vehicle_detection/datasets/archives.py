@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import (
     Limit,
     atomic_write,
-    check_integer,
-    check_path,
+    check,
     check_regular_file,
     is_hidden,
     natural_key,
@@ -123,7 +122,7 @@ def _read_member(archive: zipfile.ZipFile, member: str) -> bytes:
 
 def list_patches(source: str | os.PathLike[str], name: str) -> Listing:
     """List the images in a folder or zip; `name` is the argument's name in error messages."""
-    path = check_path(source, name, kind="the path of a folder or zip")
+    path = check.path(source, name, kind="the path of a folder or zip")
     if not path.exists():
         raise DatasetError(f"{name} {path} does not exist; check the path, or download the course's patches")
     found = _list_folder(path) if path.is_dir() else _list_zip(path)
@@ -178,7 +177,7 @@ def decode_listings(
     listings: Sequence[Listing], *, size: int, jobs: int | None, progress: bool
 ) -> NDArray[np.uint8]:
     """Decode all images into one ``(N, size, size, 3)`` array, in the order of the listings."""
-    check_integer(size, "size", low=1, high=4096)
+    check.integer(size, "size", low=1, high=4096)
     jobs = resolve_jobs(jobs) if jobs is not None else min(resolve_jobs(None), 8)
     total = sum(len(listing.names) for listing in listings)
     patches = np.empty((total, size, size, 3), np.uint8)

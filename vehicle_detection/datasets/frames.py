@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_path, natural_key
+from vehicle_detection._common import check, natural_key
 from vehicle_detection.datasets.archives import is_image
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image
@@ -56,7 +56,7 @@ def load_frames(folder: str | os.PathLike[str]) -> FrameSet:
     ...
     vehicle_detection.errors.DatasetError: folder missing does not exist or is not a folder; check the path
     """
-    path = check_path(folder, "folder", kind="the path of a folder")
+    path = check.path(folder, "folder", kind="the path of a folder")
     if not path.is_dir():
         raise DatasetError(f"folder {path} does not exist or is not a folder; check the path")
     names = [file.name for file in path.iterdir() if is_image(file.name) and file.is_file()]

@@ -14,15 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import (
-    check_array,
-    check_choice,
-    check_patches,
-    check_sequence,
-    check_type,
-    describe,
-    natural_key,
-)
+from vehicle_detection._common import check, describe, natural_key
 from vehicle_detection.datasets.archives import decode_listings, infer_labels, list_patches, parent_folder
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE
@@ -50,8 +42,8 @@ class PatchSet:
     def __post_init__(self) -> None:
         given: object = self.patches
         side = given.shape[1] if isinstance(given, np.ndarray) and given.ndim == 4 else PATCH_SIZE
-        patches = check_patches(given, side)
-        labels, names = check_labels(self.labels, "labels"), check_sequence(self.names, "names", "file names")
+        patches = check.patches(given, side)
+        labels, names = check_labels(self.labels, "labels"), check.sequence(self.names, "names", "file names")
         if not all(isinstance(name, str) for name in names):
             raise InvalidInputError("names must be strings like 'vehicles/GTI_Far/image0000.png'")
         columns: dict[str, Any] = {"patches": patches, "labels": labels, "names": names}
@@ -65,9 +57,9 @@ class PatchSet:
     @classmethod
     def concatenate(cls, sets: Sequence[PatchSet]) -> PatchSet:
         """Join several sets of the same patch size, in the given order."""
-        sets = check_sequence(sets, "sets", "PatchSet")
+        sets = check.sequence(sets, "sets", "PatchSet")
         for each in sets:
-            check_type(each, "sets", PatchSet, "read each one with load_patches")
+            check.instance(each, "sets", PatchSet, "read each one with load_patches")
         shapes = [each.patches.shape[1:] for each in sets]
         if len(set(shapes)) != 1:
             raise InvalidInputError(f"sets must be one or more sets of the same patch size; got {shapes}")
@@ -133,7 +125,7 @@ class PatchSet:
 
 def check_labels(labels: ArrayLike, name: str) -> NDArray[np.bool_]:
     """Return `labels` as a one-dimensional boolean array."""
-    array = check_array(labels, name)
+    array = check.array(labels, name)
     if array.size == 0:
         array = np.empty(0, np.bool_)
     if array.ndim != 1 or array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
@@ -179,7 +171,7 @@ def load_patches(
     >>> [name.split("/")[1] for name in patches.names]
     ['9.png', '10.png']
     """
-    check_choice(label, "label", (None, 0, 1))
+    check.choice(label, "label", (None, 0, 1))
     listing = list_patches(source, "source")
     labels = infer_labels(listing) if label is None else np.full(len(listing.names), bool(label))
     patches = decode_listings([listing], size=size, jobs=jobs, progress=progress)

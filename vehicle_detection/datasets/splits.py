@@ -9,16 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import (
-    check_array,
-    check_integer,
-    check_number,
-    check_patches,
-    check_sequence,
-    check_type,
-    describe,
-    natural_key,
-)
+from vehicle_detection._common import check, describe, natural_key
 from vehicle_detection.datasets.archives import parent_folder
 from vehicle_detection.datasets.patches import PatchSet, check_labels
 from vehicle_detection.errors import InvalidInputError
@@ -47,7 +38,7 @@ class Split:
 
     def __post_init__(self) -> None:
         for name in ("train", "test"):
-            rows = check_array(getattr(self, name), name)
+            rows = check.array(getattr(self, name), name)
             if rows.ndim != 1 or not rows.size or rows.dtype.kind not in "iu" or rows.min() < 0:
                 raise InvalidInputError(f"{name} must be a list of row numbers, got {describe(rows)}")
             object.__setattr__(self, name, rows.astype(np.intp, copy=False))
@@ -79,7 +70,7 @@ def split_random(
     given = patches_or_labels
     labels = given.labels if isinstance(given, PatchSet) else check_labels(given, "patches_or_labels")
     fraction = _check_test_size(test_size)
-    seed = check_integer(random_state, "random_state", low=0, high=2**32 - 1)
+    seed = check.integer(random_state, "random_state", low=0, high=2**32 - 1)
     rows = np.arange(len(labels))
     try:
         parts = train_test_split(rows, test_size=fraction, random_state=seed, stratify=labels)
@@ -103,7 +94,7 @@ def split_sequences(patch_set: PatchSet, *, test_size: float = 0.2) -> Split:
     >>> split_sequences(PatchSet(np.zeros((5, 64, 64, 3), np.uint8), [1] * 5, names)).test
     array([4])
     """
-    check_type(patch_set, "patch_set", PatchSet, _PATCH_SET_REMEDY)
+    check.instance(patch_set, "patch_set", PatchSet, _PATCH_SET_REMEDY)
     fraction = _check_test_size(test_size)
     folders: dict[str, list[int]] = {}
     for row, name in enumerate(patch_set.names):
@@ -146,10 +137,10 @@ def split_groups(
     >>> split_groups(patch_set, test_size=0.4).test
     array([4, 5])
     """
-    check_type(patch_set, "patch_set", PatchSet, _PATCH_SET_REMEDY)
+    check.instance(patch_set, "patch_set", PatchSet, _PATCH_SET_REMEDY)
     fraction = _check_test_size(test_size)
-    limit = check_number(threshold, "threshold", above=0, high=1)
-    seed = check_integer(random_state, "random_state", low=0, high=2**32 - 1)
+    limit = check.number(threshold, "threshold", above=0, high=1)
+    seed = check.integer(random_state, "random_state", low=0, high=2**32 - 1)
     strata = [f"{label:d}{parent_folder(name)}" for label, name in zip(patch_set.labels, patch_set.names)]
     _, stratum, sizes = np.unique(strata, return_inverse=True, return_counts=True)
     # Test patches that each folder may still give, as in split_sequences; clipping to [1, 0] gives 0.
@@ -184,13 +175,13 @@ def split_sources(
     >>> split_sources(PatchSet(np.zeros((4, 64, 64, 3), np.uint8), [1, 0, 1, 0], names)).test
     array([2, 3])
     """
-    check_type(patch_set, "patch_set", PatchSet, _PATCH_SET_REMEDY)
+    check.instance(patch_set, "patch_set", PatchSet, _PATCH_SET_REMEDY)
     known = ", ".join(patch_set.counts()) or "none"
     masks = []
     for side, prefixes in (("train", train), ("test", test)):
-        prefixes = (prefixes,) if isinstance(prefixes, str) else check_sequence(prefixes, side, "names")
+        prefixes = (prefixes,) if isinstance(prefixes, str) else check.sequence(prefixes, side, "names")
         for prefix in prefixes:
-            check_type(prefix, side, str, "name the sources by the beginnings of their names")
+            check.instance(prefix, side, str, "name the sources by the beginnings of their names")
             if not prefix or not np.char.startswith(patch_set.sources, prefix).any():
                 raise InvalidInputError(f"{side} must name sources of patch_set ({known}); got {prefix!r}")
         mask = np.array([source.startswith(prefixes) for source in patch_set.sources], np.bool_)
@@ -241,7 +232,7 @@ def find_near_duplicates(
     array([[1, 3],
            [3, 1]])
     """
-    limit = check_number(threshold, "threshold", above=0, high=1)
+    limit = check.number(threshold, "threshold", above=0, high=1)
     thumbnails = make_thumbnails(patches)
     nearest, correlation = find_nearest(thumbnails, thumbnails, same=True)
     rows = np.flatnonzero(correlation >= limit * (1 - _ROUNDING))
@@ -250,7 +241,7 @@ def find_near_duplicates(
 
 def make_thumbnails(patches: PatchSet | NDArray[np.uint8]) -> NDArray[np.float32]:
     """16x16 gray thumbnails with zero mean and unit length, ``(N, 256)``; products are correlations."""
-    images = patches.patches if isinstance(patches, PatchSet) else check_patches(patches, PATCH_SIZE)
+    images = patches.patches if isinstance(patches, PatchSet) else check.patches(patches, PATCH_SIZE)
     vectors = np.empty((len(images), 16 * 16), np.float32)
     for row, image in enumerate(images):
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
@@ -303,9 +294,9 @@ def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95)
     >>> split_leakage(patch_set, Split([0, 1], [2, 3]))
     0.5
     """
-    check_type(patch_set, "patch_set", PatchSet, _PATCH_SET_REMEDY)
-    check_type(split, "split", Split, "split_sequences and others return one")
-    limit = check_number(threshold, "threshold", above=0, high=1)
+    check.instance(patch_set, "patch_set", PatchSet, _PATCH_SET_REMEDY)
+    check.instance(split, "split", Split, "split_sequences and others return one")
+    limit = check.number(threshold, "threshold", above=0, high=1)
     last = max(int(rows.max()) for rows in split)
     if last >= len(patch_set):
         raise InvalidInputError(
@@ -318,7 +309,7 @@ def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95)
 
 
 def _check_test_size(test_size: object) -> float:
-    fraction = check_number(test_size, "test_size", above=0)
+    fraction = check.number(test_size, "test_size", above=0)
     if fraction >= 1:
         raise InvalidInputError(f"test_size must be a fraction in (0, 1), got {fraction:g}; 0.2 is a fifth")
     return fraction

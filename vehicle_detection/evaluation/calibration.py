@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_array, check_bool, check_integer, describe
+from vehicle_detection._common import check, describe
 from vehicle_detection.boxes import Platt as Platt  # its result
 from vehicle_detection.errors import InvalidInputError
 
@@ -36,8 +36,8 @@ def calibrate_scores(
     >>> bool(platt.probability(1.5) > 0.5 > platt.probability(-1.5))
     True
     """
-    check_bool(prior, "prior")
-    values, truth = check_array(scores, "scores"), check_array(labels, "labels")
+    check.boolean(prior, "prior")
+    values, truth = check.array(scores, "scores"), check.array(labels, "labels")
     if values.ndim != 1 or not values.size or values.dtype.kind not in "iuf":
         raise InvalidInputError(f"scores must be a one-dimensional array of numbers; got {describe(values)}")
     if not np.isfinite(values).all():
@@ -72,7 +72,7 @@ def _check_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64]
     """Weights with a mean of 1."""
     if weights is None:
         return np.ones(count)
-    values = check_array(weights, "weights")
+    values = check.array(weights, "weights")
     if values.shape != (count,) or values.dtype.kind not in "iuf":
         raise InvalidInputError(
             f"weights must be one number for each of the {count} scores; got {describe(values)}"
@@ -100,7 +100,7 @@ def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int 
     >>> round(calibration_error([0.9, 0.9, 0.1, 0.1], [1, 1, 0, 1]), 3)
     0.25
     """
-    values, truth = check_array(probabilities, "probabilities"), check_array(labels, "labels")
+    values, truth = check.array(probabilities, "probabilities"), check.array(labels, "labels")
     inside = values.dtype.kind in "iuf" and bool(((values >= 0) & (values <= 1)).all())
     if values.ndim != 1 or not values.size or not inside:
         raise InvalidInputError(
@@ -108,7 +108,7 @@ def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int 
             "convert scores with calibrate_scores(...).probability"
         )
     _check_truth(truth, values, "probabilities")
-    count = check_integer(bins, "bins", low=1, high=10**6)
+    count = check.integer(bins, "bins", low=1, high=10**6)
     values = values.astype(np.float64)
     chosen = np.minimum((values * count).astype(np.intp), count - 1)
     gaps = np.bincount(chosen, weights=truth.astype(np.float64) - values, minlength=count)

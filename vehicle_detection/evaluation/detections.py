@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_flags, check_number
+from vehicle_detection._common import check
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.matching import DetectionMatches, match_detections, prepare_evaluation
 from vehicle_detection.tables import FrameKey, TrackTable
@@ -162,9 +162,9 @@ def evaluate_detections(
     >>> scores.precision, scores.recall, scores.average_precision
     (0.5, 0.5, 0.5)
     """
-    check_flags(ignored_as_regions=ignored_as_regions)
+    check.flags(ignored_as_regions=ignored_as_regions)
     predictions, labels, keys = prepare_evaluation(predictions, labels, frames)
-    min_iou = check_number(iou, "iou", above=0, high=1)
+    min_iou = check.number(iou, "iou", above=0, high=1)
     found = match_detections(predictions, labels, keys, min_iou, ignored_as_regions=ignored_as_regions)
     hit, false, missed = found.match >= 0, (found.match < 0) & ~found.ignored, found.missed
 
@@ -208,11 +208,11 @@ def precision_recall_curve(
     >>> precision_recall_curve(found, labels)
     (array([1. , 0.5]), array([0.5, 0.5]), array([2. , 0.5]))
     """
-    check_flags(ignored_as_regions=ignored_as_regions)
+    check.flags(ignored_as_regions=ignored_as_regions)
     predictions, labels, keys = prepare_evaluation(predictions, labels, None)
     if len(predictions) and "score" not in predictions.columns:
         raise InvalidInputError("predictions need scores for a curve; pass a TrackTable with score=")
-    min_iou = check_number(iou, "iou", above=0, high=1)
+    min_iou = check.number(iou, "iou", above=0, high=1)
     found = match_detections(predictions, labels, keys, min_iou, ignored_as_regions=ignored_as_regions)
     return _curve(predictions, found)
 

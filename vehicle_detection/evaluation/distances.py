@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_number
+from vehicle_detection._common import check
 from vehicle_detection.evaluation.detections import Scores, format_number, format_summary, ratio
 from vehicle_detection.evaluation.matching import match_detections, prepare_evaluation
 from vehicle_detection.tables import FrameKey, TrackTable
@@ -111,7 +111,7 @@ def evaluate_distances(
     distances and speeds
       distance, 20-40 m  error 0.050, bias +0.000, within 1 / 2 std 0.500 / 1.000, stated 2 of 2
     """
-    min_iou = check_number(iou, "iou", above=0, high=1)
+    min_iou = check.number(iou, "iou", above=0, high=1)
     predictions, labels, keys = prepare_evaluation(predictions, labels, frames)
     scored = TrackTable(
         labels["frame"].tolist(), labels["track_id"], labels.boxes, ignore=np.zeros(len(labels), bool)

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import Floats, check_boxes, check_image, check_type, describe
+from vehicle_detection._common import Floats, check, describe
 from vehicle_detection.boxes import clip_boxes, iou_matrix
 from vehicle_detection.detector import Detector, VehicleDetector
 from vehicle_detection.errors import InvalidInputError
@@ -119,10 +119,10 @@ def explain(detector: Detector | VehicleDetector, image: NDArray[np.uint8], box:
     >>> explanation.found, explanation.margin < 0
     (False, True)
     """
-    check_type(detector, "detector", (Detector, VehicleDetector), "pass VehicleDetector()")
+    check.instance(detector, "detector", (Detector, VehicleDetector), "pass VehicleDetector()")
     detector = detector.detector if isinstance(detector, VehicleDetector) else detector
-    frame = check_image(image)
-    boxes = check_boxes([box], "box").astype(np.float64)
+    frame = check.image(image)
+    boxes = check.boxes([box], "box").astype(np.float64)
     if boxes.shape != (1, 4) or (boxes[:, 2:] - boxes[:, :2] < 1).any():
         raise InvalidInputError(f"box must be [x1, y1, x2, y2], 1 pixel or larger; got {describe(box)}")
     model = detector.model

@@ -10,14 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    check_image,
-    check_integer,
-    check_type,
-    describe,
-    pluralize,
-    store_number,
-)
+from vehicle_detection._common import check, describe, pluralize, store_number
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.matching import match_names
@@ -65,7 +58,7 @@ class LabelledFrames:
         keys, labels = self.keys, self.labels
         if not keys:
             raise InvalidInputError("frames must hold at least one image, got none")
-        check_type(labels, "labels", TrackTable, "read a file with read_labels")
+        check.instance(labels, "labels", TrackTable, "read a file with read_labels")
         labels = match_names(labels, keys, ("labels", "frames"))
         if labels.frame_keys and not set(keys) & set(labels.frame_keys):
             raise InvalidInputError(
@@ -90,7 +83,7 @@ class LabelledFrames:
 
     def __iter__(self) -> Iterator[tuple[FrameKey, NDArray[np.uint8]]]:
         for key, image in self.frames.items() if isinstance(self.frames, Mapping) else self.frames:
-            yield key, check_image(image, f"frame {key!r}")
+            yield key, check.image(image, f"frame {key!r}")
 
     @classmethod
     def from_video(
@@ -108,7 +101,7 @@ class LabelledFrames:
         """
         from vehicle_detection.video import read_frames
 
-        step = check_integer(every, "every", low=1)
+        step = check.integer(every, "every", low=1)
         with read_frames(path) as reader:
             chosen: dict[FrameKey, NDArray[np.uint8]] = {
                 index: frame for index, _, frame in reader if index % step == 0

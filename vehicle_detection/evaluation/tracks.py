@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Floats, check_flags, check_number
+from vehicle_detection._common import Floats, check
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.detections import Scores, format_number, format_summary, mean, rates, ratio
@@ -111,9 +111,9 @@ def evaluate_tracks(
     >>> scores.id_switches, round(scores.mota, 3), round(scores.hota, 3), scores.jitter
     (1, 0.667, 0.745, 0.25)
     """
-    check_flags(ignored_as_regions=ignored_as_regions)
+    check.flags(ignored_as_regions=ignored_as_regions)
     predictions, labels, keys = prepare_evaluation(predictions, labels, frames)
-    min_iou = check_number(iou, "iou", above=0, high=1)
+    min_iou = check.number(iou, "iou", above=0, high=1)
     _check_tracks(predictions, "predictions", keys)
     _check_tracks(labels, "labels", keys)
     clip = _match_tracks(predictions, labels, keys, min_iou, ignored_as_regions)

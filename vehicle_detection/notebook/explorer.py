@@ -17,15 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    check_choice,
-    check_image,
-    check_integer,
-    check_number,
-    check_sequence,
-    describe,
-    pluralize,
-)
+from vehicle_detection._common import check, describe, pluralize
 from vehicle_detection.boxes import Detections, box_areas
 from vehicle_detection.camera import Camera, open_camera
 from vehicle_detection.datasets import FrameSet
@@ -137,7 +129,7 @@ class Explorer:
         if isinstance(search_params, SearchParams):
             search_params = search_params.with_horizon(horizon)
         detector = Detector(model, search_params=search_params, region_params=region_params, camera=camera)
-        self._width = check_integer(width, "width", low=16, high=10_000)
+        self._width = check.integer(width, "width", low=16, high=10_000)
         self.camera = detector.camera
         self._search = detector.model.open_search()
         self._read_frame = functools.lru_cache(_CACHED_FRAMES)(lambda name: self._readers[name]())
@@ -171,18 +163,18 @@ class Explorer:
     def set_frame(self, frame: int | str) -> None:
         """Select a frame by its name or number."""
         if isinstance(frame, (int, np.integer)):
-            frame = self.names[check_integer(frame, "frame", low=0, high=len(self.names) - 1)]
-        check_choice(frame, "frame", self.names)
+            frame = self.names[check.integer(frame, "frame", low=0, high=len(self.names) - 1)]
+        check.choice(frame, "frame", self.names)
         self.frame = frame
 
     def set_view(self, view: View) -> None:
         """Select what images show, one of `VIEWS`."""
-        check_choice(view, "view", VIEWS)
+        check.choice(view, "view", VIEWS)
         self.view = view
 
     def set_box(self, number: int) -> None:
         """Select the box that images explain, from 1 for the one with the highest score; 0: none."""
-        self.box = check_integer(number, "number", low=0)
+        self.box = check.integer(number, "number", low=0)
 
     def set_search(
         self,
@@ -207,8 +199,8 @@ class Explorer:
             if not self._all_bands:
                 raise InvalidInputError("bands must be None for this model; its search has no bands")
             last = len(self._all_bands) - 1
-            given = check_sequence(bands, "bands", "band numbers")
-            self.bands = tuple(sorted({check_integer(band, "bands", low=0, high=last) for band in given}))
+            given = check.sequence(bands, "bands", "band numbers")
+            self.bands = tuple(sorted({check.integer(band, "bands", low=0, high=last) for band in given}))
         self.search_params, self.camera = params, camera
 
     def set_regions(
@@ -228,7 +220,7 @@ class Explorer:
         predicts boxes.
         """
         method = self.method if method is None else method
-        check_choice(method, "method", METHODS)
+        check.choice(method, "method", METHODS)
         changes = {"threshold": threshold, "peak_fraction": peak_fraction, "weighting": weighting}
         heat = _replace(self.heat_params, **changes)
         groups = _replace(self.group_params, min_peak=min_peak, min_evidence=min_evidence)
@@ -278,7 +270,7 @@ class Explorer:
 
     def box_at(self, x: float, y: float) -> int:
         """Return the number, as in `set_box`, of the smallest box at a pixel of the frame; 0: none."""
-        x, y = check_number(x, "x"), check_number(y, "y")
+        x, y = check.number(x, "x"), check.number(y, "y")
         boxes = self.boxes().boxes
         left, top, right, bottom = boxes.T
         inside = (left <= x) & (x < right) & (top <= y) & (y < bottom)
@@ -448,5 +440,5 @@ def _frame_readers(frames: object) -> dict[str, Callable[[], Image]]:
 def _frame_reader(frame: Any, name: str) -> Callable[[], Image]:
     if isinstance(frame, (str, os.PathLike)):
         return functools.partial(read_image, frame)
-    checked = check_image(frame, name)
+    checked = check.image(frame, name)
     return lambda: checked

@@ -10,14 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import (
-    check_choice,
-    check_image,
-    check_integer,
-    check_patches,
-    check_type,
-    describe,
-)
+from vehicle_detection._common import check, describe
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import Explanation
@@ -116,9 +109,9 @@ def plot_channels(
     >>> [panel.get_xlabel() for panel in figure.axes]
     ['H', 'S', 'V', 'H', 'H', 'S']
     """
-    check_choice(color_space, "color_space", COLOR_SPACES)
-    rng = np.random.default_rng(check_integer(random_state, "random_state", low=0))
-    max_points = check_integer(points, "points", low=1, high=1_000_000)
+    check.choice(color_space, "color_space", COLOR_SPACES)
+    rng = np.random.default_rng(check.integer(random_state, "random_state", low=0))
+    max_points = check.integer(points, "points", low=1, high=1_000_000)
     groups = _pixels_by_class(images, labels)
     names = channel_names(color_space)
     figure, (upper, lower) = style.new_panels(figure, (11, 6), 2, 3)
@@ -158,7 +151,7 @@ def _pixels_by_class(images: object, labels: ArrayLike | None) -> list[tuple[str
         labels = images.labels if labels is None else labels
         images = images.patches
     listed = style.check_list(images, "images", "images")
-    flat = [check_image(image, f"images[{index}]").reshape(-1, 3) for index, image in enumerate(listed)]
+    flat = [check.image(image, f"images[{index}]").reshape(-1, 3) for index, image in enumerate(listed)]
     known = style.check_numbers(labels, "labels", len(flat), "images")
     if known is None:
         return [(None, "0.35", np.concatenate(flat))]
@@ -189,15 +182,15 @@ def plot_hog(
     >>> len(plot_hog(patch, pix_per_cell=[8]).axes)
     6
     """
-    check_type(params, "params", FeatureParams | None, "omit it for the default")
+    check.instance(params, "params", FeatureParams | None, "omit it for the default")
     params = params or FeatureParams()
     single = isinstance(images, np.ndarray) and images.ndim == 3
     listed, names = style.split_titles([images] if single else images)
     sizes = style.check_list(pix_per_cell, "pix_per_cell", "cell sizes")
-    cell_sizes = [check_integer(cell, "pix_per_cell", low=2) for cell in sizes]
+    cell_sizes = [check.integer(cell, "pix_per_cell", low=2) for cell in sizes]
     columns, side = [], max(cell_sizes) * params.cell_per_block
     for index, (image, name) in enumerate(zip(listed, names)):
-        source = hog_source(check_image(image, f"images[{index}]"), params)
+        source = hog_source(check.image(image, f"images[{index}]"), params)
         if min(source.shape[:2]) < side:
             raise InvalidInputError(
                 f"images[{index}] must have at least the size of a block ({side}x{side} pixels), got "
@@ -242,9 +235,9 @@ def plot_features(
     >>> len(figure.axes[1].lines[0].get_ydata())
     2628
     """
-    images = check_patches(patches.patches if isinstance(patches, PatchSet) else patches, PATCH_SIZE)
+    images = check.patches(patches.patches if isinstance(patches, PatchSet) else patches, PATCH_SIZE)
     numbers = style.check_list(rows, "rows", "row numbers")
-    chosen = [check_integer(row, "rows", low=0, high=len(images) - 1) for row in numbers]
+    chosen = [check.integer(row, "rows", low=0, high=len(images) - 1) for row in numbers]
     labels = style.check_length(names, "names", len(chosen), "rows")
     params, mean, scale = _scaler(images, model, template)
     raw = extract_features(images[chosen], params)
@@ -281,7 +274,7 @@ def _scaler(
 ) -> tuple[FeatureParams, NDArray[np.float64], NDArray[np.float64]]:
     """Feature parameters, mean and scale."""
     if isinstance(model, VehicleClassifier):
-        known = model.templates[check_integer(template, "template", low=0, high=len(model.templates) - 1)]
+        known = model.templates[check.integer(template, "template", low=0, high=len(model.templates) - 1)]
         return model.params, known.mean, known.scale
     if not isinstance(model, FeatureParams):
         raise InvalidInputError(
@@ -313,8 +306,8 @@ def plot_weights(
     >>> [panel.get_title() for panel in plot_weights(load_classifier()).axes[:2]]
     ['HOG, positive', 'HOG, negative']
     """
-    check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
-    number = check_integer(template, "template", low=0, high=len(classifier.templates) - 1)
+    check.instance(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+    number = check.integer(template, "template", low=0, high=len(classifier.templates) - 1)
     chosen = classifier.templates[number]
     params = classifier.params
     weights = {part: chosen.coef[rows] for part, rows in part_slices(params).items()}
@@ -410,8 +403,8 @@ def plot_explanation(
     """
     from matplotlib.colors import to_rgb
 
-    height, width = check_image(image).shape[:2]
-    check_type(explanation, "explanation", Explanation, "pass what explain returned")
+    height, width = check.image(image).shape[:2]
+    check.instance(explanation, "explanation", Explanation, "pass what explain returned")
     figure, grid = style.new_panels(figure, (10.5, 3.6), 1, 3)
     plain, shares, sums = grid.flat
     score = "not found" if explanation.score is None else f"score {explanation.score:.2f}"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_integer
+from vehicle_detection._common import check
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.notebook import style
@@ -45,7 +45,7 @@ def show_images(
     count = len(shown)
     found = style.check_length(boxes, "boxes", count, "images")
     true = style.check_length(truth, "truth", count, "images")
-    per_row = min(3, count) if columns is None else check_integer(columns, "columns", low=1, high=100)
+    per_row = min(3, count) if columns is None else check.integer(columns, "columns", low=1, high=100)
     rows = math.ceil(count / per_row)
     width = max(2.0, min(12.5 / per_row, 6.5))
     height = width * float(np.median([image.shape[0] / image.shape[1] for image in shown]))
@@ -91,7 +91,7 @@ def plot_patches(
     classes = style.check_numbers(labels, "labels", len(images), "patches")
     texts = style.check_length(captions, "captions", len(images), "patches")
     values = style.check_numbers(scores, "scores", len(images), "patches")
-    rows = style.evenly_spaced(len(images), check_integer(count, "count", low=1, high=1000)).tolist()
+    rows = style.evenly_spaced(len(images), check.integer(count, "count", low=1, high=1000)).tolist()
     if not rows:
         raise InvalidInputError("patches must hold at least one patch; got none")
     tiles = []

@@ -9,13 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    check_choice,
-    check_integer,
-    check_number,
-    check_type,
-    describe,
-)
+from vehicle_detection._common import check, describe
 from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
@@ -54,7 +48,7 @@ def plot_precision_recall(
     if not named:
         raise InvalidInputError("curves must hold at least one curve; got none")
     checked = {str(name): _check_curve(curve, str(name)) for name, curve in named.items()}
-    limit = math.inf if threshold is None else check_number(threshold, "threshold")
+    limit = math.inf if threshold is None else check.number(threshold, "threshold")
     axes = style.new_axes(ax, 6.5, 6)
     for level in (0.2, 0.4, 0.6, 0.8, 0.9):
         x = np.linspace(level / (2 - level), 1, 100)
@@ -111,10 +105,10 @@ def plot_errors(
     >>> plot_errors(frames, TrackTable(score=[])).get_title()
     '1 of 1 vehicles missed'
     """
-    check_type(frames, "frames", LabelledFrames, "pass LabelledFrames(name, frames, labels)")
-    check_choice(kind, "kind", ("missed", "false"))
-    min_iou = check_number(iou, "iou", above=0, high=1)
-    max_count = check_integer(count, "count", low=1, high=1000)
+    check.instance(frames, "frames", LabelledFrames, "pass LabelledFrames(name, frames, labels)")
+    check.choice(kind, "kind", ("missed", "false"))
+    min_iou = check.number(iou, "iou", above=0, high=1)
+    max_count = check.integer(count, "count", low=1, high=1000)
     predictions, labels, keys = prepare_evaluation(predictions, frames.labels, frames.keys)
     matches = match_detections(predictions, labels, keys, min_iou)
     if kind == "missed":

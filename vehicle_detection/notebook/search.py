@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from vehicle_detection._common import check_image, check_type, describe, pluralize
+from vehicle_detection._common import check, describe, pluralize
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import HeatParams, frame_heat, heat_threshold, label_heat
@@ -41,7 +41,7 @@ def plot_windows(
     >>> axes.collections[0].get_array().tolist(), axes.get_title()
     ([0.5, 1.5], '2 windows')
     """
-    height, width = check_image(image).shape[:2]
+    height, width = check.image(image).shape[:2]
     boxes = style.box_array(windows, "windows")
     true = style.box_array(() if truth is None else truth, "truth")
     axes = style.new_axes(ax, 8.5, 8.5 * height / width + 0.6)
@@ -84,8 +84,8 @@ def plot_bands(
     >>> len(figure.axes), figure.axes[1].get_title()
     (3, '64x64 px, step 8x8, 3,825 windows')
     """
-    height, width = check_image(image).shape[:2]
-    check_type(search, "search", SearchParams | None, "pass SearchParams.preset()")
+    height, width = check.image(image).shape[:2]
+    check.instance(search, "search", SearchParams | None, "pass SearchParams.preset()")
     search = search or SearchParams.preset()
     bands = search.place(image.shape)
     columns = 2 if len(bands) in (2, 4) else min(len(bands), 3)
@@ -139,9 +139,9 @@ def plot_heatmap(
     >>> [panel.get_title() for panel in figure.axes[:3]]
     ['2 windows', 'heat, peak 3.0', '1 region above 2']
     """
-    height, width = check_image(image).shape[:2]
-    check_type(windows, "windows", Detections, "pass what find_cars returns, or Detections(boxes, scores)")
-    check_type(params, "params", HeatParams | None, "pass HeatParams()")
+    height, width = check.image(image).shape[:2]
+    check.instance(windows, "windows", Detections, "pass what find_cars returns")
+    check.instance(params, "params", HeatParams | None, "pass HeatParams()")
     params = params or HeatParams()
     heat = frame_heat(image.shape, windows, params) if heat is None else heat
     if np.shape(heat) != (height, width):

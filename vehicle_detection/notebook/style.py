@@ -12,15 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Union
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import (
-    check_array,
-    check_boxes,
-    check_image,
-    check_integer,
-    check_sequence,
-    check_type,
-    describe,
-)
+from vehicle_detection._common import check, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
@@ -88,7 +80,7 @@ def new_panels(
 
     if figure is None:
         figure = _notebook_figure_class()(figsize=size, layout=layout)
-    check_type(figure, "figure", FigureBase, "pass a Figure, a SubFigure, or None for a new figure")
+    check.instance(figure, "figure", FigureBase, "pass a Figure, a SubFigure, or None for a new figure")
     grid = np.asarray(figure.subplots(rows, columns, squeeze=False, sharex=sharex))
     for unused in grid.flat[grid.size if count is None else count :]:
         unused.remove()
@@ -103,7 +95,7 @@ def new_axes(ax: Axes | None, width: float = 7.0, height: float = 4.5) -> Axes:
         import matplotlib.pyplot as plt
 
         ax = plt.subplots(figsize=(width, height), layout="constrained")[1]
-    check_type(ax, "ax", AxesClass, "pass matplotlib Axes, or None for a new figure")
+    check.instance(ax, "ax", AxesClass, "pass matplotlib Axes, or None for a new figure")
     return ax
 
 
@@ -125,7 +117,7 @@ def check_displayable(image: object, name: str) -> NDArray[Any]:
     """Return an ``(H, W, 3)`` uint8 RGB image or a non-empty ``(H, W)`` array of numbers."""
     if isinstance(image, np.ndarray) and image.ndim == 2 and image.size and image.dtype.kind in "iufb":
         return image
-    return check_image(image, name)
+    return check.image(image, name)
 
 
 def check_list(values: object, name: str, kind: str) -> list[Any]:
@@ -144,7 +136,7 @@ def check_length(values: Sequence[object] | None, name: str, count: int, entries
     """Return `values` as a list of `count` entries; None stands for `count` times None."""
     if values is None:
         return [None] * count
-    listed = list(check_sequence(values, name, "values"))
+    listed = list(check.sequence(values, name, "values"))
     if len(listed) != count:
         raise InvalidInputError(
             f"{name} must have one value for each of the {count} {entries}, got {len(listed)}"
@@ -156,7 +148,7 @@ def check_numbers(values: ArrayLike | None, name: str, count: int, entries: str)
     """Return `values` as an array with one number for each of `count` entries; None stays None."""
     if values is None:
         return None
-    array = check_array(values, name)
+    array = check.array(values, name)
     if array.shape != (count,) or array.dtype.kind not in "biuf":
         raise InvalidInputError(
             f"{name} must be one number for each of {count} {entries}; got {describe(array)}"
@@ -179,7 +171,7 @@ def box_array(boxes: Boxes, name: str = "boxes") -> NDArray[Any]:
         return boxes.boxes
     if isinstance(boxes, TrackTable):
         return np.asarray(boxes.boxes[~boxes["ignore"]])
-    return check_boxes(boxes, name)
+    return check.boxes(boxes, name)
 
 
 def add_image(ax: Axes, image: NDArray[Any], title: str = "", *, ticks: bool = False, **options: Any) -> None:
@@ -232,7 +224,7 @@ def add_tiles(
     `colors` draws an edge around each image. Returns the Axes, and for each image its left and top and the
     size of a pixel in data coordinates.
     """
-    columns = max(min(check_integer(columns, "columns", low=1, high=100), len(tiles)), 1)
+    columns = max(min(check.integer(columns, "columns", low=1, high=100), len(tiles)), 1)
     rows = max(math.ceil(len(tiles) / columns), 1)
     # Height of a tile with its caption; its width is 1.
     pitch = (inches + 0.17 * caption_lines) / inches

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vehicle_detection._common import Floats, check_number, check_type
+from vehicle_detection._common import Floats, check
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.notebook import style
 from vehicle_detection.notebook.style import COLORS, LINESTYLES, YELLOW, FigureLike
@@ -54,8 +54,8 @@ def plot_tracks(
     >>> figure.axes[0].lines[0].get_xydata()[-1].tolist()
     [0.4, 39.0]
     """
-    rate = check_number(fps, "fps", above=0, high=1e6)
-    shortest = check_number(min_frames, "min_frames", low=1)
+    rate = check.number(fps, "fps", above=0, high=1e6)
+    shortest = check.number(min_frames, "min_frames", low=1)
     table = results if isinstance(results, TrackTable) else TrackTable.from_results(results)
     found = _columns_by_track(table, "results", rate)
     tracks = {number: columns for number, columns in found.items() if columns.shape[1] >= shortest}
@@ -74,7 +74,7 @@ def plot_tracks(
             panel.plot(time, values, color=color, linestyle=dash, linewidth=1.8, label=f"#{number}")
             if not np.isnan(stds).all():
                 panel.fill_between(time, values - stds, values + stds, color=color, alpha=0.25, linewidth=0)
-    check_type(truth, "truth", TrackTable | None, "read a file with read_labels or pass drive.labels")
+    check.instance(truth, "truth", TrackTable | None, "read a file with read_labels or pass drive.labels")
     if truth is not None:
         true = _columns_by_track(truth[~truth["ignore"]], "truth", rate)
         for index, (time, *columns) in enumerate(true.values()):

@@ -14,8 +14,7 @@ from vehicle_detection import _kernels as kernels
 from vehicle_detection._common import (
     Checked,
     blur_patches,
-    check_array,
-    check_type,
+    check,
     degrade_patches,
     describe,
     flag,
@@ -112,7 +111,7 @@ def train_classifier(
     """
     params, options = check_training(params, options)
     if metadata is not None:
-        check_type(metadata, "metadata", Mapping, "pass a dictionary")
+        check.instance(metadata, "metadata", Mapping, "pass a dictionary")
     images, targets = _read_training_set(patches, labels)
     features = patch_features(images, params, options, jobs=jobs)
     return fit_features(features, targets, params, options, estimator=estimator, metadata=metadata)
@@ -201,14 +200,14 @@ def check_training(
     """Return both, with the defaults for None."""
     params = FeatureParams() if params is None else params
     options = TrainingOptions() if options is None else options
-    check_type(params, "params", FeatureParams, "omit it for the default")
-    check_type(options, "options", TrainingOptions, "omit it for the default")
+    check.instance(params, "params", FeatureParams, "omit it for the default")
+    check.instance(options, "options", TrainingOptions, "omit it for the default")
     return params, options
 
 
 def check_labels(labels: ArrayLike, count: int) -> NDArray[np.int64]:
     """Return `labels` as `count` integers 0 or 1, both of which must occur."""
-    array = check_array(labels, "labels")
+    array = check.array(labels, "labels")
     if array.shape != (count,) or array.dtype.kind not in "biuf":
         raise InvalidInputError(
             f"labels must hold one number for each of {count} patches; got {describe(array)}"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import vehicle_detection
-from vehicle_detection._common import atomic_write, check_patches, check_path
+from vehicle_detection._common import atomic_write, check
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE, FeatureParams
 from vehicle_detection.training.classifier import TrainingOptions, patch_features
@@ -49,10 +49,10 @@ class FeatureCache:
         folder: str | os.PathLike[str] | None = None,
         jobs: int | None = None,
     ) -> None:
-        self.patches = check_patches(patches, PATCH_SIZE)
+        self.patches = check.patches(patches, PATCH_SIZE)
         self.digest = digest_of(self.patches)
         self._jobs = jobs
-        self._folder = None if folder is None else check_path(folder, "cache", kind="a folder")
+        self._folder = None if folder is None else check.path(folder, "cache", kind="a folder")
         if self._folder is not None:
             try:
                 self._folder.mkdir(parents=True, exist_ok=True)

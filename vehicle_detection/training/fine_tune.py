@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._common import check_choice, check_integer, check_path, pluralize
+from vehicle_detection._common import check, pluralize
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.network import NetworkModel, load_network
@@ -94,9 +94,9 @@ def fine_tune_network(
         Called with the number of finished steps and a line with the time left, every 10 s.
     """
     checked = check_sources(sources)
-    seed = check_integer(random_state, "random_state", low=0)
+    seed = check.integer(random_state, "random_state", low=0)
     place = _check_device(device)
-    path = None if checkpoint is None else check_path(checkpoint, "checkpoint")
+    path = None if checkpoint is None else check.path(checkpoint, "checkpoint")
     model = load_network(initial)
     network = read_weights(model.graph, model.name)
     kept, held_out = hold_out(checked)
@@ -104,7 +104,7 @@ def fine_tune_network(
     if held_out:
         load_training_frames(held_out)  # checks their boxes before the training
     count = min(max(_STEPS_PER_FRAME * len(frames), _MIN_STEPS), _MAX_STEPS)
-    count = count if steps is None else check_integer(steps, "steps", low=1)
+    count = count if steps is None else check.integer(steps, "steps", low=1)
     training = NetworkTraining(
         steps=count,
         batch=_BATCH,
@@ -237,7 +237,7 @@ def _check_device(device: str | None) -> str:
     available = torch.cuda.is_available()
     if device is None:
         return "cuda" if available else "cpu"
-    check_choice(device, "device", ("cpu", "cuda"))
+    check.choice(device, "device", ("cpu", "cuda"))
     if device == "cuda" and not available:
         raise InvalidInputError("device must be 'cpu', PyTorch finds no CUDA device; install its driver")
     return device

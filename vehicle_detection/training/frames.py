@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, check_type, describe
+from vehicle_detection._common import check, describe
 from vehicle_detection.datasets import FrameSet, load_frames
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, match_names
@@ -49,7 +49,7 @@ class FrameDataset:
         if not isinstance(sets, (tuple, list)) or not sets:
             raise InvalidInputError(f"sets must be a tuple of at least one entry; got {describe(sets)}")
         for part in sets:
-            check_type(part, "sets", LabelledFrames, "pass the frames with their labels as LabelledFrames")
+            check.instance(part, "sets", LabelledFrames, "pass frames with labels as LabelledFrames")
         object.__setattr__(self, "sets", tuple(sets))
 
 
@@ -60,7 +60,7 @@ def check_sources(sources: object) -> tuple[FrameDataset, ...]:
             f"sources must be a list of FrameDataset, one or more; got {describe(sources)}"
         )
     for source in sources:
-        check_type(source, "sources", FrameDataset, "wrap the frames of each camera or country in one")
+        check.instance(source, "sources", FrameDataset, "wrap the frames of each camera or country in one")
     names = [source.name for source in sources]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
@@ -181,7 +181,7 @@ def load_training_frames(
     A frame whose longer side exceeds `max_side` pixels is reduced to it, and its boxes with it.
     """
     if max_side is not None:
-        max_side = check_integer(max_side, "max_side", low=16)
+        max_side = check.integer(max_side, "max_side", low=16)
     loaded = []
     for source in check_sources(sources):
         for part in source.sets:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, check_number, check_type
+from vehicle_detection._common import check
 from vehicle_detection.boxes import intersection_matrix, non_max_suppression
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.evaluation import Frames, LabelledFrames, keyed_frames
@@ -63,14 +63,14 @@ def mine_negatives(
     >>> len(mine_negatives([road], TrackTable(frame_keys=[0]), load_classifier()))
     0
     """
-    check_type(source, "source", str, "pass a name for the patches' source folder")
+    check.instance(source, "source", str, "pass a name for the patches' source folder")
     labelled = LabelledFrames(source, keyed_frames(frames), labels)
-    overlap = check_number(max_overlap, "max_overlap", low=0, high=1)
-    limit = None if max_per_frame is None else check_integer(max_per_frame, "max_per_frame", low=1)
-    check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+    overlap = check.number(max_overlap, "max_overlap", low=0, high=1)
+    limit = None if max_per_frame is None else check.integer(max_per_frame, "max_per_frame", low=1)
+    check.instance(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
     given = SearchParams.preset() if search_params is None else search_params
-    check_type(given, "search_params", SearchParams, "omit it for the default")
-    params = dataclasses.replace(given, min_score=check_number(min_score, "min_score"))
+    check.instance(given, "search_params", SearchParams, "omit it for the default")
+    params = dataclasses.replace(given, min_score=check.number(min_score, "min_score"))
     patches: list[NDArray[np.uint8]] = []
     names: list[str] = []
     with contextlib.closing(classifier.open_search(jobs)) as search:

@@ -18,14 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    check_choice,
-    check_integer,
-    check_type,
-    pluralize,
-    progress_bar,
-    resolve_jobs,
-)
+from vehicle_detection._common import check, pluralize, progress_bar, resolve_jobs
 from vehicle_detection.datasets import PatchSet, Split, make_split, split_leakage, split_sequences
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import calibrate_scores, calibration_error
@@ -160,12 +153,12 @@ def train_and_evaluate(
     >>> sorted(report.splits), len(report.splits["random"].accuracies), report.vehicles
     (['random', 'sequences'], 2, 10)
     """
-    check_type(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
+    check.instance(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
     labels = check_labels(patch_set.labels, len(patch_set))
     params, options = check_training(params, options)
-    check_choice(split, "split", ("random", "sequences"))
-    check_integer(seeds, "seeds", low=1, high=1000)
-    random_state = check_integer(options.random_state, "random_state", low=0, high=2**32 - seeds)
+    check.choice(split, "split", ("random", "sequences"))
+    check.integer(seeds, "seeds", low=1, high=1000)
+    random_state = check.integer(options.random_state, "random_state", low=0, high=2**32 - seeds)
     splits, skipped = _make_splits(patch_set, split, range(random_state, random_state + seeds))
     inner = _inner_split(patch_set, splits["sequences"][0]) if "sequences" in splits else None
     fits = [("final", None), *((name, part) for name, listed in splits.items() for part in listed)]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer
+from vehicle_detection._common import check
 from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.scenes import Drive, Scene, SceneVehicle, VehicleTruth, render_drive, render_scene
 from vehicle_detection.tables import FrameKey, TrackTable
@@ -62,8 +62,8 @@ def rendered_source(*, frames: int = 300, random_state: int = 0) -> FrameDataset
     >>> rendered_source(frames=2).sets
     (LabelledFrames('rendered', 2 frames, 14 boxes),)
     """
-    count = check_integer(frames, "frames", low=1)
-    seed = check_integer(random_state, "random_state", low=0, high=2**32 - 1)
+    count = check.integer(frames, "frames", low=1)
+    seed = check.integer(random_state, "random_state", low=0, high=2**32 - 1)
     scenes = dict(enumerate(itertools.islice(_scenes(seed), count)))
     images: dict[FrameKey, NDArray[np.uint8]] = {key: scene.image for key, scene in scenes.items()}
     rows = [(key, scene, row) for key, scene in scenes.items() for row in scene.truth]

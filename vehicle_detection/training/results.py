@@ -12,13 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    atomic_write,
-    check_path,
-    check_suffix,
-    describe,
-    import_pyarrow,
-)
+from vehicle_detection._common import atomic_write, check, check_suffix, describe, import_pyarrow
 from vehicle_detection.errors import DatasetError, InvalidInputError
 
 if TYPE_CHECKING:
@@ -134,7 +128,7 @@ def read_results(path: str | os.PathLike[str]) -> DataFrame:
     """
     import pandas as pd
 
-    file = check_path(path)
+    file = check.path(path)
     if file.suffix.lower() not in (".csv", ".jsonl"):
         raise InvalidInputError(f"path must end in .csv or .jsonl; got {file.name!r}")
     if not file.is_file():

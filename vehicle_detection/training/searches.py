@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from vehicle_detection._common import check_number, check_sequence, check_type
+from vehicle_detection._common import check
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, evaluate_detections
 from vehicle_detection.features import PATCH_SIZE
@@ -56,14 +56,14 @@ def compare_searches(
     """
     import pandas as pd
 
-    check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
-    check_type(frames, "frames", LabelledFrames, "pass LabelledFrames(name, images, labels)")
+    check.instance(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+    check.instance(frames, "frames", LabelledFrames, "pass LabelledFrames(name, images, labels)")
     sets = [
         [
-            check_number(side, "scales", low=0.25, high=20)
-            for side in check_sequence(each, "scales", "numbers")
+            check.number(side, "scales", low=0.25, high=20)
+            for side in check.sequence(each, "scales", "numbers")
         ]
-        for each in check_sequence(scales, "scales", "sets of numbers")
+        for each in check.sequence(scales, "scales", "sets of numbers")
     ]
     steps = _check_numbers(overlaps, "overlaps", 0.99)
     limits = _check_numbers(thresholds, "thresholds", 1e9)
@@ -91,4 +91,4 @@ def compare_searches(
 
 
 def _check_numbers(values: Sequence[float], name: str, high: float) -> list[float]:
-    return [check_number(each, name, low=0, high=high) for each in check_sequence(values, name, "numbers")]
+    return [check.number(each, name, low=0, high=high) for each in check.sequence(values, name, "numbers")]

@@ -20,16 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    check_choice,
-    check_integer,
-    check_number,
-    check_sequence,
-    check_type,
-    describe,
-    is_listing,
-    progress_bar,
-)
+from vehicle_detection._common import check, describe, is_listing, progress_bar
 from vehicle_detection.datasets import SEEDED_SPLITS, SPLIT_NAMES, PatchSet, Split, make_split
 from vehicle_detection.detector import Detector
 from vehicle_detection.errors import InvalidInputError
@@ -106,7 +97,7 @@ class TrialOptions:
         """The sets of `frames` as a tuple."""
         if self.frames is None or isinstance(self.frames, LabelledFrames):
             return () if self.frames is None else (self.frames,)
-        return check_sequence(self.frames, "frames", "LabelledFrames")
+        return check.sequence(self.frames, "frames", "LabelledFrames")
 
 
 def compare_configurations(
@@ -165,11 +156,11 @@ def compare_configurations(
     >>> compare_configurations(patch_set, grid, splits="random", options=untimed)["status"].tolist()
     ['ok', 'failed']
     """
-    values = [C] if isinstance(C, (int, float)) else check_sequence(C, "C", "numbers")
+    values = [C] if isinstance(C, (int, float)) else check.sequence(C, "C", "numbers")
     if not values:
         raise InvalidInputError("C must be a number or several; got none")
     for value in values:
-        check_number(value, "C")
+        check.number(value, "C")
     candidates = read_configurations(configurations, values)
     parts: list[tuple[Any, Any, Any]] = list(_make_splits(patch_set, splits, _check_seeds(seeds)))
     trials, stored, rows = Trials(patch_set, options), RowStore(store, COLUMNS), []
@@ -396,11 +387,11 @@ def _make_splits(
                 )
             yield str(name), seeds[0], split
         return
-    names = (splits,) if isinstance(splits, str) else check_sequence(splits, "splits", "names of splits")
+    names = (splits,) if isinstance(splits, str) else check.sequence(splits, "splits", "names of splits")
     if not names:
         raise InvalidInputError(f"splits must name at least one of {', '.join(SPLIT_NAMES)}")
     for name in names:
-        check_choice(name, "splits", SPLIT_NAMES)
+        check.choice(name, "splits", SPLIT_NAMES)
         for seed in seeds if name in SEEDED_SPLITS else seeds[:1]:
             yield name, seed, make_split(patch_set, name, random_state=seed)
 
@@ -408,7 +399,7 @@ def _make_splits(
 def _check_seeds(seeds: object) -> tuple[int, ...]:
     """Return the seeds if they are different integers."""
     listed = seeds if is_listing(seeds) else ()
-    checked = tuple(check_integer(seed, "seeds", low=0, high=2**32 - 1) for seed in listed)
+    checked = tuple(check.integer(seed, "seeds", low=0, high=2**32 - 1) for seed in listed)
     if not checked or len(set(checked)) < len(checked):
         raise InvalidInputError(
             f"seeds must be a list of different integers, such as range(5); got {describe(seeds)}"
@@ -421,8 +412,8 @@ class Trials:
 
     def __init__(self, patch_set: PatchSet, options: TrialOptions | None) -> None:
         options = TrialOptions() if options is None else options
-        check_type(options, "options", TrialOptions, "omit it for the defaults")
-        check_type(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
+        check.instance(options, "options", TrialOptions, "omit it for the defaults")
+        check.instance(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
         cache = options.cache
         if not isinstance(cache, FeatureCache):
             cache = FeatureCache(patch_set.patches, folder=cache, jobs=options.jobs)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Floats, atomic_write, check_number, resolve_jobs, spreadsheet_text
+from vehicle_detection._common import Floats, atomic_write, check, resolve_jobs, spreadsheet_text
 from vehicle_detection.boxes import Platt
 from vehicle_detection.evaluation import (
     DetectionMatches,
@@ -170,7 +170,7 @@ def detect_in_source(
     Scores are log-odds above the model's own threshold; a low `min_score` covers all thresholds in use. The
     result does not depend on `jobs`, the number of frames searched at the same time.
     """
-    lowest = check_number(min_score, "min_score")
+    lowest = check.number(min_score, "min_score")
     with model.open_search(jobs=1) as search, ThreadPoolExecutor(resolve_jobs(jobs)) as pool:
 
         def detect(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Any]:
