@@ -27,7 +27,6 @@ ALLOWED = {
     ("cli", "drive"),
     ("cli", "notebook"),
     ("cli", "scenes"),
-    ("training", "scenes"),
 }
 
 HEAVY = {"matplotlib", "moviepy", "sklearn", "pandas", "pooch", "jinja2", "dask", "pyarrow", "motmetrics"}

@@ -386,7 +386,6 @@ class _Valid:
             "write_tracks": {"results": predicted},
             "notebook.plot_errors": {"frames": frames},
             "notebook.plot_explanation": {"explanation": vd.explain(detector, image, boxes[0])},
-            "notebook.plot_features": {"model": classifier},
             "notebook.plot_tracks": {"results": predicted},
             "notebook.plot_weights": {"classifier": vd.load_classifier("highway")},
         }

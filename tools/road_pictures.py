@@ -14,10 +14,10 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from tools.rendered import rendered_source
 from vehicle_detection import Annotator, Camera, DrawParams, VehicleDetector, track, write_image
 from vehicle_detection._common import atomic_write
 from vehicle_detection.notebook import show_images
-from vehicle_detection.training import rendered_source
 
 SEED = 99
 """Seed of the scenes; the shipped network was trained on those of seed 0."""

@@ -65,8 +65,7 @@ def ring(name: str) -> str:
 def is_upward(name: str, other: str) -> bool:
     """Whether an import goes from the core to an outer ring, or between outer rings."""
     source, target = ring(name), ring(other)
-    training = name.startswith("vehicle_detection.training") and target == "scenes"
-    return target not in ("core", source) and source != "cli" and not training and "__main__" not in name
+    return target not in ("core", source) and source != "cli" and "__main__" not in name
 
 
 def code_lines(source: str, node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:

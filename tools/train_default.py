@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from tools.error_pictures import write_pictures
 from tools.measure_model import RIDES, choose_sources
 from tools.model_card import write_card
+from tools.rendered import rendered_source
 from tools.rides import kept_rides
 from vehicle_detection._common import atomic_write, check_target
 from vehicle_detection.errors import VehicleDetectionError
@@ -37,7 +38,6 @@ from vehicle_detection.training import (
     load_content,
     load_training_frames,
     package_versions,
-    rendered_source,
     score_logits,
     select_frames,
     set_metadata,

@@ -25,17 +25,12 @@ RESULT = FrameResult(0, None, NONE, NONE, ())
 @pytest.mark.parametrize(
     ("name", "arguments", "options", "argument"),
     [
-        ("plot_channels", [IMAGE, "XYZ"], {}, "color_space"),
-        ("plot_channels", [[IMAGE]], {"labels": [1, 0]}, "labels"),
         (
             "plot_hog",
             [gray_image(30, 30)],
             {"pix_per_cell": [16]},
             "images.0. must have at least the size",
         ),
-        ("plot_features", [PATCHES, MODEL], {"rows": [3]}, "rows"),
-        ("plot_features", [PATCHES, MODEL], {"names": ["a", "b"]}, "names"),
-        ("plot_features", [PATCHES, "m"], {}, "model must be .* pass load_classifier"),
         ("plot_windows", [IMAGE, [1, 2, 3, 4]], {}, "windows"),
         ("plot_windows", [IMAGE, []], {"truth": [[5, 0, 1, 1]]}, "truth"),
         ("plot_bands", [gray_image(10)], {}, "image of 160x10 pixels holds no search window"),

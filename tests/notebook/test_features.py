@@ -2,43 +2,11 @@ import numpy as np
 import pytest
 from skimage.feature import hog
 
-from tests.helpers import random_classifier, rendered_patches
-from tests.notebook.helpers import SMALL, legend, texts, titles
+from tests.helpers import rendered_patches
+from tests.notebook.helpers import SMALL, titles
 from vehicle_detection import notebook
-from vehicle_detection.features import FeatureParams, extract_features
-from vehicle_detection.notebook.style import OTHER, VEHICLE
+from vehicle_detection.features import FeatureParams
 from vehicle_detection.svm import Template, VehicleClassifier
-
-
-def test_channels_of_an_image_are_plotted_in_the_colors_of_its_pixels():
-    image = np.zeros((10, 10, 3), np.uint8)
-    image[:5] = (255, 0, 0)
-    figure = notebook.plot_channels(image, "RGB")
-    red = figure.axes[0].patches[0]
-    assert red.get_data().values.sum() == pytest.approx(100)
-    assert red.get_data().values[[0, 127]].tolist() == [50, 50]
-    assert figure.axes[0].get_ylabel() == "pixels (%)"
-    points = figure.axes[3].collections[0]
-    colors = points.get_facecolors()[:, :3]
-    # each point has the color of its pixel
-    np.testing.assert_array_equal(colors[:, 0] * 255, points.get_offsets()[:, 0])
-    assert figure.axes[0].get_legend() is None
-
-
-def test_channels_of_two_classes_are_plotted_separately(patch_set):
-    figure = notebook.plot_channels(patch_set, "LAB", points=50)
-    assert legend(figure.axes[0]) == ["vehicle", "other"]
-    assert [axes.get_xlabel() for axes in figure.axes[:3]] == ["L", "a", "b"]
-    for axes in figure.axes[:3]:
-        assert [stairs.get_data().values.sum() for stairs in axes.patches] == pytest.approx([100, 100])
-    assert [len(points.get_offsets()) for points in figure.axes[4].collections] == [50, 50]
-    again, other = (
-        notebook.plot_channels(patch_set, "LAB", points=50, random_state=seed).axes[4].collections[0]
-        for seed in (0, 1)
-    )
-    offsets = figure.axes[4].collections[0].get_offsets()
-    np.testing.assert_array_equal(again.get_offsets(), offsets)
-    assert (other.get_offsets() != offsets).any()
 
 
 def test_hog_has_a_panel_per_channel_and_cell_size():
@@ -81,27 +49,6 @@ def test_a_glyph_is_parallel_to_the_edge(ahead, slope):
     y, x = np.nonzero(picture[16:48, 16:48] > 0.8 * picture.max())
     if ahead[0] and ahead[1]:
         assert np.sign(np.corrcoef(x, y)[0, 1]) == np.sign(along[0] * along[1])
-
-
-def test_vectors_are_plotted_before_and_after_scaling(patch_set):
-    classifier = random_classifier(SMALL)
-    figure = notebook.plot_features(patch_set, classifier, rows=[3, 30], names=["car", "road"])
-    above, below = figure.axes
-    raw = extract_features(patch_set.patches[[3, 30]], SMALL)
-    template = classifier.templates[0]
-    for line, scaled, values in zip(above.lines, below.lines, raw):
-        np.testing.assert_array_equal(line.get_ydata(), values)
-        np.testing.assert_allclose(scaled.get_ydata(), (values - template.mean) / template.scale)
-    assert legend(above) == ["car", "road"]
-    classes = patch_set.labels[[3, 30]].tolist()
-    for rows in ([3, 30], [30, 3]):
-        lines = notebook.plot_features(patch_set, classifier, rows=rows).axes[0].lines
-        colors = [VEHICLE if patch_set.labels[row] else OTHER for row in rows]
-        assert [line.get_color() for line in lines] == colors
-    assert sorted(classes) == [False, True]
-    parts = ["spatial bins (192)", "color histogram (24)", "HOG (648)"]
-    assert texts(above.texts) == parts
-    assert below.get_ylabel() == "value (standard deviations)"
 
 
 def classifier_with_mean(params):

@@ -16,7 +16,6 @@ def test_upward_imports():
     assert structure.is_upward(package + "course.heat", package + "scenes")
     assert not structure.is_upward(package + "course.heat", package + "search")
     assert not structure.is_upward(package + "cli.demo", package + "scenes")
-    assert not structure.is_upward(package + "training.rendered", package + "scenes")
 
 
 def test_lines_of_code_are_without_docstring_comments_and_blank_lines():

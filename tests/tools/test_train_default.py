@@ -11,9 +11,10 @@ from safetensors.torch import save_model
 from tests.helpers import drawn, write_frame_set
 from tests.training.networks import random_network
 from tools import rides, train_default
+from tools.rendered import rendered_source
 from vehicle_detection.errors import DatasetError
 from vehicle_detection.network import load_network
-from vehicle_detection.training import NetworkTraining, export_network, rendered_source
+from vehicle_detection.training import NetworkTraining, export_network
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 from .explorer import Explorer as Explorer
-from .features import plot_channels as plot_channels
 from .features import plot_explanation as plot_explanation
-from .features import plot_features as plot_features
 from .features import plot_hog as plot_hog
 from .features import plot_weights as plot_weights
 from .images import plot_patches as plot_patches

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from vehicle_detection._common import check, describe
-from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import Explanation
 from vehicle_detection.features import (
-    COLOR_SPACES,
     PATCH_SIZE,
     FeatureParams,
-    convert_color,
-    extract_features,
     hog_blocks,
     hog_source,
     part_slices,
@@ -41,7 +36,6 @@ _MANY_CELLS = 24
 _AROUND, _MAX_ALPHA = 0.25, 0.75
 
 _CHANNEL_NAMES = {"YCrCb": ("Y", "Cr", "Cb"), "LAB": ("L", "a", "b")}
-_CHANNEL_PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
 def channel_names(color_space: str) -> tuple[str, ...]:
@@ -87,79 +81,6 @@ def add_glyphs(
     ax.set_facecolor("black")
     ax.set(xlim=(0, columns * size), ylim=(rows * size, 0), aspect="equal", xticks=[], yticks=[])
     return lines
-
-
-def plot_channels(
-    images: Image | PatchSet | Sequence[Image],
-    color_space: str = "YCrCb",
-    *,
-    labels: ArrayLike | None = None,
-    points: int = 4000,
-    random_state: int = 0,
-    figure: FigureLike | None = None,
-) -> FigureLike:
-    """Plot the distribution of pixels in a color space, of each channel and of pairs of channels.
-
-    `images` is one ``(H, W, 3)`` uint8 RGB image, several images, or a set of patches. With `labels`,
-    ``(N,)`` 1 for a vehicle and 0 for anything else, by default those of a set, there is a curve per class;
-    without, each point has the color of its pixel. The lower panels show `points` randomly chosen pixels per
-    class.
-
-    >>> figure = plot_channels(np.full((8, 8, 3), 90, np.uint8), "HSV")
-    >>> [panel.get_xlabel() for panel in figure.axes]
-    ['H', 'S', 'V', 'H', 'H', 'S']
-    """
-    check.choice(color_space, "color_space", COLOR_SPACES)
-    rng = np.random.default_rng(check.integer(random_state, "random_state", low=0))
-    max_points = check.integer(points, "points", low=1, high=1_000_000)
-    groups = _pixels_by_class(images, labels)
-    names = channel_names(color_space)
-    figure, (upper, lower) = style.new_panels(figure, (11, 6), 2, 3)
-    converted = [convert_color(pixels[None], color_space)[0] for _, _, pixels in groups]
-    for (label, color, pixels), values in zip(groups, converted):
-        for channel, panel in enumerate(upper):
-            fractions = np.bincount(values[:, channel] // 2, minlength=128) / len(values)
-            panel.stairs(100 * fractions, np.arange(0, 257, 2), color=color, label=label, linewidth=1.4)
-        chosen = rng.choice(len(values), min(max_points, len(values)), replace=False)
-        point_colors = pixels[chosen] / 255 if label is None else [color]
-        for panel, (first, second) in zip(lower, _CHANNEL_PAIRS):
-            x, y = values[chosen, first], values[chosen, second]
-            panel.scatter(x, y, s=3, c=point_colors, alpha=0.5, linewidths=0, label=label)
-    limits = [_axis_limits([values[:, channel] for values in converted]) for channel in range(3)]
-    for name, panel, limit in zip(names, upper, limits):
-        panel.set(xlabel=name, ylabel="pixels (%)", xlim=limit)
-    for panel, (first, second) in zip(lower, _CHANNEL_PAIRS):
-        panel.set(xlabel=names[first], ylabel=names[second], xlim=limits[first], ylim=limits[second])
-    if groups[0][0] is not None:
-        upper[0].legend(fontsize=9)
-    figure.suptitle(f"{color_space}, 8 bits per channel", fontsize=11)
-    return figure
-
-
-def _axis_limits(channel: list[NDArray[np.uint8]]) -> tuple[float, float]:
-    """Axis limits that contain all but 0.1% of each class's pixels at either end."""
-    ends = np.concatenate([np.quantile(values, (0.001, 0.999)) for values in channel])
-    margin = max(2.0, 0.04 * float(np.ptp(ends)))
-    return max(0.0, float(ends.min()) - margin), min(256.0, float(ends.max()) + margin)
-
-
-def _pixels_by_class(images: object, labels: ArrayLike | None) -> list[tuple[str | None, Any, Image]]:
-    """Name, color and ``(N, 3)`` RGB pixels of each class, or of all images without labels."""
-    if isinstance(images, np.ndarray) and images.ndim == 3:
-        images = [images]
-    elif isinstance(images, PatchSet):
-        labels = images.labels if labels is None else labels
-        images = images.patches
-    listed = style.check_list(images, "images", "images")
-    flat = [check.image(image, f"images[{index}]").reshape(-1, 3) for index, image in enumerate(listed)]
-    known = style.check_numbers(labels, "labels", len(flat), "images")
-    if known is None:
-        return [(None, "0.35", np.concatenate(flat))]
-    return [
-        (name, color, np.concatenate(list(itertools.compress(flat, mask))))
-        for name, color, mask in (("vehicle", style.VEHICLE, known > 0), ("other", style.OTHER, known <= 0))
-        if mask.any()
-    ]
 
 
 def plot_hog(
@@ -213,78 +134,6 @@ def plot_hog(
     for panel, cell in zip(grid[1:, 0], cell_sizes):
         panel.set_ylabel(f"{cell} px cells", fontsize=9)
     return figure
-
-
-def plot_features(
-    patches: PatchSet | NDArray[np.uint8] | Sequence[Image],
-    model: VehicleClassifier | FeatureParams,
-    *,
-    rows: Sequence[int] = (0,),
-    names: Sequence[str] | None = None,
-    template: int = 0,
-    figure: FigureLike | None = None,
-) -> FigureLike:
-    """Plot feature vectors, a line per row, before and after scaling, with their parts shaded.
-
-    Before scaling, histogram counts are much larger than HOG values; after scaling, all parts have the same
-    range. `rows` are numbers of the ``(N, 64, 64, 3)`` `patches`, with one of `names` each. The scaler is
-    that of a template of a classifier; for a `model` of parameters, it is fitted to all of `patches`.
-
-    >>> from vehicle_detection import render_patches
-    >>> figure = plot_features(render_patches(8)[0], FeatureParams(hog_channel=0))
-    >>> len(figure.axes[1].lines[0].get_ydata())
-    2628
-    """
-    images = check.patches(patches.patches if isinstance(patches, PatchSet) else patches, PATCH_SIZE)
-    numbers = style.check_list(rows, "rows", "row numbers")
-    chosen = [check.integer(row, "rows", low=0, high=len(images) - 1) for row in numbers]
-    labels = style.check_length(names, "names", len(chosen), "rows")
-    params, mean, scale = _scaler(images, model, template)
-    raw = extract_features(images[chosen], params)
-    figure, grid = style.new_panels(figure, (11, 5.5), 2, 1, sharex=True)
-    above, below = grid.flat
-    shades = (style.COLORS[1], style.COLORS[3], "0.6", style.COLORS[2])
-    colors = [style.VEHICLE, style.OTHER, *style.LINE_COLORS[2:]]
-    classes = patches.labels[chosen].tolist() if isinstance(patches, PatchSet) else []
-    if classes and len(set(classes)) == len(classes):  # at most one row of each class
-        colors = [style.VEHICLE if vehicle else style.OTHER for vehicle in classes]
-    for panel, values in ((above, raw), (below, (raw - mean) / scale)):
-        for line, label, color in zip(values, labels, colors * len(chosen)):
-            text = None if label is None else str(label)
-            panel.plot(line, linewidth=0.6, color=color, label=text)
-        for row, (shade, (name, part)) in enumerate(zip(shades, part_slices(params).items())):
-            label, middle = f"{name} ({part.stop - part.start:,})", (part.start + part.stop) / 2
-            top = panel.get_xaxis_transform()
-            panel.axvspan(part.start, part.stop, color=shade, alpha=0.18, linewidth=0)
-            offset = 0, 3 + 10 * (row % 2)  # names of narrow parts are wider than these
-            panel.annotate(label, (middle, 1.0), offset, top, "offset points", ha="center", fontsize=8)
-    above.set(ylabel="value", xlim=(0, params.length))
-    below.set(ylabel="value (standard deviations)", xlabel="feature")
-    above.set_title("before scaling", loc="right", fontsize=10)
-    below.set_title("after scaling", loc="right", fontsize=10)
-    if any(label is not None for label in labels):
-        legend = above.legend(loc="upper right", fontsize=9)
-        for handle in legend.get_lines():
-            handle.set_linewidth(2)
-    return figure
-
-
-def _scaler(
-    images: Image, model: object, template: int
-) -> tuple[FeatureParams, NDArray[np.float64], NDArray[np.float64]]:
-    """Feature parameters, mean and scale."""
-    if isinstance(model, VehicleClassifier):
-        known = model.templates[check.integer(template, "template", low=0, high=len(model.templates) - 1)]
-        return model.params, known.mean, known.scale
-    if not isinstance(model, FeatureParams):
-        raise InvalidInputError(
-            f"model must be a VehicleClassifier or FeatureParams, got {describe(model)}; "
-            "pass load_classifier() or FeatureParams()"
-        )
-    features = extract_features(images, model).astype(np.float64)
-    scale = features.std(axis=0)
-    scale[scale == 0] = 1  # as StandardScaler does for constant features
-    return model, features.mean(axis=0), scale
 
 
 # Largest difference, in gray levels, between the mean patch and the patch shifted along the weights.

@@ -33,7 +33,6 @@ from .patches import split_table as split_table
 from .patches import train_and_evaluate as train_and_evaluate
 from .pipeline import PatchFeatures as PatchFeatures
 from .pipeline import to_pipeline as to_pipeline
-from .rendered import rendered_source as rendered_source
 from .results import RowStore as RowStore
 from .results import check_column as check_column
 from .results import check_replaceable as check_replaceable

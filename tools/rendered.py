@@ -13,7 +13,7 @@ from vehicle_detection._common import check
 from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.scenes import Drive, Scene, SceneVehicle, VehicleTruth, render_drive, render_scene
 from vehicle_detection.tables import FrameKey, TrackTable
-from vehicle_detection.training.frames import FrameDataset
+from vehicle_detection.training import FrameDataset
 
 Rng = np.random.Generator
 

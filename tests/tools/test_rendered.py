@@ -3,8 +3,7 @@ import itertools
 import numpy as np
 import pytest
 
-from vehicle_detection.training import rendered_source
-from vehicle_detection.training.rendered import _LANE, _traffic
+from tools.rendered import _LANE, _traffic, rendered_source
 
 
 @pytest.fixture(scope="module")
