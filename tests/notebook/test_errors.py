@@ -31,8 +31,6 @@ RESULT = FrameResult(0, None, NONE, NONE, ())
             {"pix_per_cell": [16]},
             "images.0. must have at least the size",
         ),
-        ("plot_windows", [IMAGE, [1, 2, 3, 4]], {}, "windows"),
-        ("plot_windows", [IMAGE, []], {"truth": [[5, 0, 1, 1]]}, "truth"),
         ("plot_bands", [gray_image(10)], {}, "image of 160x10 pixels holds no search window"),
         ("plot_heatmap", [IMAGE, [[0, 0, 1, 1]]], {}, "windows"),
         ("plot_heatmap", [IMAGE, NONE], {"heat": np.zeros((5, 5))}, "heat must be .* add_heat"),

@@ -1,38 +1,13 @@
 import numpy as np
 import pytest
 
-from tests.notebook.helpers import drawn_boxes, gray_image, new_axes, texts, titles
+from tests.notebook.helpers import drawn_boxes, gray_image, texts, titles
 from vehicle_detection import notebook
 from vehicle_detection.boxes import Detections
 from vehicle_detection.heatmap import HeatParams, bounding_boxes, frame_heat
 from vehicle_detection.notebook.style import SKY, VERMILION, YELLOW
 from vehicle_detection.search import SearchParams
 from vehicle_detection.windows import band_windows
-
-
-def test_windows_are_colored_by_score_best_last():
-    found = Detections([[0, 0, 64, 64], [8, 0, 72, 64], [16, 0, 80, 64]], [1.5, -0.5, 0.5])
-    axes = notebook.plot_windows(gray_image(), found, truth=[[1, 1, 60, 60]], ax=new_axes())
-    lines, true = axes.collections
-    assert lines.get_array().tolist() == [-0.5, 0.5, 1.5]
-    assert drawn_boxes(lines).tolist() == found.boxes[[1, 2, 0]].tolist()
-    assert drawn_boxes(true).tolist() == [[1, 1, 60, 60]]
-    assert (axes.get_title(), axes.get_xlabel(), axes.get_ylabel()) == ("3 windows", "x (px)", "y (px)")
-    assert axes.figure.axes[1].get_ylabel() == "score"
-    assert (axes.get_xlim(), axes.get_ylim()) == ((0, 160), (90, 0))
-
-
-def test_windows_without_scores_and_outside_the_frame():
-    axes = notebook.plot_windows(
-        gray_image(), np.array([[-32, 10, 32, 74], [130, 40, 194, 104]]), ax=new_axes()
-    )
-    assert len(axes.figure.axes) == 1
-    assert axes.collections[0].get_array() is None
-    assert (axes.get_xlim(), axes.get_ylim()) == ((-32, 194), (104, 0))
-    one = notebook.plot_windows(gray_image(), [[0, 0, 9, 9]], ax=new_axes())
-    assert one.get_title() == "1 window"
-    none = notebook.plot_windows(gray_image(), Detections.empty(), title="nothing", ax=new_axes())
-    assert none.get_title() == "nothing"
 
 
 @pytest.mark.parametrize("preset", ["130-windows", "three-scales", "default"])

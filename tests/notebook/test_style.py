@@ -19,7 +19,7 @@ def test_figures_of_several_panels_are_not_managed_by_pyplot():
 
 def test_a_single_panel_uses_the_given_axes_or_a_pyplot_figure():
     axes = new_axes()
-    assert notebook.plot_windows(gray_image(), [[1, 2, 30, 40]], ax=axes) is axes
+    assert notebook.plot_patches([gray_image()], ax=axes) is axes
     assert not plt.get_fignums()
-    own = notebook.plot_windows(gray_image(), [[1, 2, 30, 40]])
+    own = notebook.plot_patches([gray_image()])
     assert plt.get_fignums() == [own.figure.number]

@@ -17,6 +17,7 @@ from vehicle_detection._common.files import (
     check_suffix,
     check_target,
     is_hidden,
+    make_folder,
     open_locked,
     private_folder,
     temporary_folder,

@@ -49,6 +49,18 @@ def check_suffix(target: str | os.PathLike[str], name: str, suffixes: Sequence[s
     return path
 
 
+def make_folder(path: str | os.PathLike[str], name: str) -> Path:
+    """Create a folder and those above it, if they are missing, and return it."""
+    folder = check.path(path, name, kind="a folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInputError(
+            f"{name} must be a folder, {folder} cannot be created: {error.strerror}; choose another"
+        ) from error
+    return folder
+
+
 def write_text(target: str | os.PathLike[str], text: str, name: str = "target") -> None:
     """Write a text as UTF-8 with Unix line ends, as a whole or not at all."""
     with atomic_write(target, name) as part:

@@ -26,6 +26,7 @@ from vehicle_detection._common import (
     check,
     check_regular_file,
     is_hidden,
+    make_folder,
     natural_key,
     progress_bar,
     read_regular_file,
@@ -103,21 +104,19 @@ class Listing:
             yield lambda member: read_regular_file(
                 self.path / member, f"{member} of {self.path}", Limit.IMAGE_BYTES, error=DatasetError
             )
-        else:
-            with open_archive(self.path) as archive:
-                yield lambda member: _read_member(archive, member)
+            return
+        limit = Limit.IMAGE_BYTES.current()
+        with open_archive(self.path) as archive:
 
+            def read(member: str) -> bytes:
+                with archive.open(member) as file:
+                    data = file.read(limit + 1)  # whatever size the archive states
+                if len(data) > limit:
+                    name = Limit.IMAGE_BYTES.variable
+                    raise ValueError(f"larger than {limit:,} bytes; set {name} if it is meant to be")
+                return data
 
-def _read_member(archive: zipfile.ZipFile, member: str) -> bytes:
-    """Read a member of limited size, whatever size the archive states for it."""
-    limit = Limit.IMAGE_BYTES.current()
-    with archive.open(member) as file:
-        data = file.read(limit + 1)
-    if len(data) > limit:
-        raise ValueError(
-            f"larger than {limit:,} bytes; set {Limit.IMAGE_BYTES.variable} if it is meant to be"
-        )
-    return data
+            yield read
 
 
 def list_patches(source: str | os.PathLike[str], name: str) -> Listing:
@@ -294,12 +293,7 @@ def _fetch(target: Path, address: str, counts: dict[str, int], progress: bool) -
             return target
         except DatasetError as error:
             _LOGGER.warning("the existing file is not the archive, downloading it again: %s", error)
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidInputError(
-            f"folder {target.parent} cannot be created: {error.strerror}; choose another"
-        ) from error
+    make_folder(target.parent, "folder")
     for part in target.parent.glob(f".{target.stem}.*{target.suffix}"):
         # Partial downloads of killed processes; a running download keeps its file's time recent.
         with contextlib.suppress(OSError):

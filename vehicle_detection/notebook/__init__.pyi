@@ -9,7 +9,6 @@ from .quality import plot_precision_recall as plot_precision_recall
 from .quality import plot_tradeoff as plot_tradeoff
 from .search import plot_bands as plot_bands
 from .search import plot_heatmap as plot_heatmap
-from .search import plot_windows as plot_windows
 from .tracks import plot_tracks as plot_tracks
 
 __all__: list[str]

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check, describe, pluralize
+from vehicle_detection._common import check, invalid, pluralize
 from vehicle_detection.boxes import Detections, box_areas
 from vehicle_detection.camera import Camera, open_camera
 from vehicle_detection.datasets import FrameSet
@@ -33,7 +33,7 @@ from vehicle_detection.drawing import (
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 from vehicle_detection.evaluation import Explanation, explain
 from vehicle_detection.heatmap import HeatParams, frame_heat, label_heat
-from vehicle_detection.images import read_image
+from vehicle_detection.images import image_array
 from vehicle_detection.network import NetworkModel, NetworkParams
 from vehicle_detection.notebook.widgets import METHOD_CONTROLS, Panel, build_widgets
 from vehicle_detection.regions import RegionParams, find_vehicles
@@ -124,7 +124,7 @@ class Explorer:
         horizon: float | None = None,
         width: int = 960,
     ) -> None:
-        self._readers = _frame_readers(frames)
+        images = _name_frames(frames)
         camera = open_camera(camera, horizon=horizon)
         if isinstance(search_params, SearchParams):
             search_params = search_params.with_horizon(horizon)
@@ -132,11 +132,11 @@ class Explorer:
         self._width = check.integer(width, "width", low=16, high=10_000)
         self.camera = detector.camera
         self._search = detector.model.open_search()
-        self._read_frame = functools.lru_cache(_CACHED_FRAMES)(lambda name: self._readers[name]())
+        self._read_frame = functools.lru_cache(_CACHED_FRAMES)(lambda name: image_array(images[name]))
         self._search_frame = functools.lru_cache(_CACHED_SEARCHES)(self._search_frame_uncached)
         self._compute = functools.lru_cache(4)(lambda method, state: method(self))
         self.model = detector.model
-        self.names = tuple(self._readers)
+        self.names = tuple(images)
         self.frame = self.names[0]
         self.view: View = "windows"
         self.box = 0
@@ -415,30 +415,23 @@ def _draw_windows(image: Image, windows: Detections, scale: float) -> None:
         cv2.rectangle(image, (x1, y1), (x2 - 1, y2 - 1), color, 1)
 
 
-def _frame_readers(frames: object) -> dict[str, Callable[[], Image]]:
-    """Name each frame and return a function that reads it; arrays are checked now, files when read."""
+def _name_frames(frames: object) -> dict[str, Any]:
+    """Images or paths by name; arrays are checked now, files when they are read."""
     if isinstance(frames, FrameSet):
         frames = {name: frames.folder / name for name in frames.names}
     elif isinstance(frames, (list, tuple)):
+        are_paths = [isinstance(frame, (str, os.PathLike)) for frame in frames]
         paths = [
-            str(frame) if isinstance(frame, (str, os.PathLike)) else f"frame {number}"
-            for number, frame in enumerate(frames)
+            str(frame) if is_path else f"frame {n}"
+            for n, (frame, is_path) in enumerate(zip(frames, are_paths))
         ]
         names = [Path(path).name for path in paths]
         # Two files of the same name are named by their paths.
         frames = dict(zip(names if len(set(names)) == len(names) else paths, frames))
-    if not isinstance(frames, Mapping):
-        raise InvalidInputError(
-            f"frames must be a list of images or paths, or a mapping from names to them; "
-            f"got {describe(frames)}; wrap a single one in a list"
-        )
-    if not frames:
-        raise InvalidInputError("frames must hold at least one image; got none")
-    return {str(name): _frame_reader(frame, f"frames[{str(name)!r}]") for name, frame in frames.items()}
-
-
-def _frame_reader(frame: Any, name: str) -> Callable[[], Image]:
-    if isinstance(frame, (str, os.PathLike)):
-        return functools.partial(read_image, frame)
-    checked = check.image(frame, name)
-    return lambda: checked
+    if not isinstance(frames, Mapping) or not frames:
+        expected = "be a list of images or paths, or a mapping from names to them, with at least one image"
+        raise invalid("frames", expected, frames, "wrap a single one in a list")
+    for name, frame in frames.items():
+        if not isinstance(frame, (str, os.PathLike)):
+            check.image(frame, f"frames[{str(name)!r}]")
+    return {str(name): frame for name, frame in frames.items()}

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from vehicle_detection._common import check, describe, pluralize
@@ -14,60 +14,12 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import HeatParams, frame_heat, heat_threshold, label_heat
 from vehicle_detection.notebook import style
-from vehicle_detection.notebook.style import SKY, TRUTH, VERMILION, YELLOW, Boxes, FigureLike, Image
+from vehicle_detection.notebook.style import SKY, VERMILION, YELLOW, FigureLike, Image
 from vehicle_detection.search import SearchParams
 from vehicle_detection.windows import band_windows
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
-def plot_windows(
-    image: Image,
-    windows: Detections | ArrayLike,
-    *,
-    truth: Boxes | None = None,
-    title: str | None = None,
-    ax: Axes | None = None,
-) -> Axes:
-    """Draw windows on a frame, colored by score; the title is their number, unless it is given.
-
-    `windows` are `Detections`, as `find_cars` returns, or ``(N, 4)`` boxes without scores, as `slide_window`
-    returns, drawn in one color; `truth` are labelled boxes, drawn with dashed lines. The first collection of
-    the Axes holds the windows in ascending order of score, and their scores.
-
-    >>> found = Detections([[0, 0, 64, 64], [8, 0, 72, 64]], [1.5, 0.5])
-    >>> axes = plot_windows(np.zeros((72, 128, 3), np.uint8), found)
-    >>> axes.collections[0].get_array().tolist(), axes.get_title()
-    ([0.5, 1.5], '2 windows')
-    """
-    height, width = check.image(image).shape[:2]
-    boxes = style.box_array(windows, "windows")
-    true = style.box_array(() if truth is None else truth, "truth")
-    axes = style.new_axes(ax, 8.5, 8.5 * height / width + 0.6)
-    style.add_image(axes, image, ticks=True)
-    linewidth = 1.4 if len(boxes) < 60 else 0.8
-    if isinstance(windows, Detections) and len(windows):
-        order = np.argsort(windows.scores, kind="stable")
-        lines = style.add_boxes(axes, boxes[order], halo=len(boxes) < 400, linewidths=linewidth)
-        lines.set_array(windows.scores[order])
-        lines.set_cmap("plasma")
-        axes.figure.colorbar(lines, ax=axes, shrink=0.75, pad=0.02).set_label("score")
-    else:
-        style.add_boxes(axes, boxes, SKY, halo=False, linewidths=linewidth)
-    if len(true):
-        style.add_boxes(axes, true, TRUTH, linestyles="--", linewidths=2.0)
-    _expand_limits(axes, boxes, width, height)
-    axes.set(xlabel="x (px)", ylabel="y (px)")
-    axes.set_title(pluralize(len(boxes), "window") if title is None else title, fontsize=10)
-    return axes
-
-
-def _expand_limits(axes: Axes, boxes: NDArray[Any], width: int, height: int) -> None:
-    """Expand the axis limits to boxes that extend beyond the frame."""
-    left, top = boxes[:, :2].min(axis=0, initial=0)
-    right, bottom = np.maximum((width, height), boxes[:, 2:].max(axis=0, initial=0))
-    axes.set(xlim=(left, right), ylim=(bottom, top))
+    pass
 
 
 def plot_bands(
@@ -106,7 +58,8 @@ def plot_bands(
         style.add_boxes(panel, bound[None], YELLOW)
         style.add_boxes(panel, np.array(neighbors).reshape(-1, 4), SKY, linewidths=1.0)
         style.add_boxes(panel, windows[:1], VERMILION, linewidths=1.4)
-        _expand_limits(panel, bounds, width, height)
+        right, bottom = np.maximum((width, height), bounds[:, 2:].max(axis=0))
+        panel.set(xlim=(min(0, bounds[:, 0].min()), right), ylim=(bottom, min(0, bounds[:, 1].min())))
         side, step = (f"{x}x{y}" for x, y in (band.window, band.step))
         panel.set_title(f"{side} px, step {step}, {pluralize(len(windows), 'window')}", fontsize=9)
     handles = style.legend_lines(

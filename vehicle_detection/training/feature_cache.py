@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import vehicle_detection
-from vehicle_detection._common import atomic_write, check
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection._common import atomic_write, check, make_folder
 from vehicle_detection.features import PATCH_SIZE, FeatureParams
 from vehicle_detection.training.classifier import TrainingOptions, patch_features
 
@@ -52,14 +51,7 @@ class FeatureCache:
         self.patches = check.patches(patches, PATCH_SIZE)
         self.digest = digest_of(self.patches)
         self._jobs = jobs
-        self._folder = None if folder is None else check.path(folder, "cache", kind="a folder")
-        if self._folder is not None:
-            try:
-                self._folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise InvalidInputError(
-                    f"cache must be a folder, {folder} cannot be created ({error.strerror}); choose another"
-                ) from error
+        self._folder = None if folder is None else make_folder(folder, "cache")
         self._last = functools.lru_cache(1)(self._read)
 
     def features(self, params: FeatureParams, *, mirror: bool = False) -> NDArray[np.float32]:

@@ -8,7 +8,7 @@ import importlib.metadata
 import math
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -157,10 +157,11 @@ def hold_out(sources: Sequence[FrameDataset]) -> tuple[list[FrameDataset], list[
     held = {id(part): _held_keys(part.keys) for part in parts}
     if not any(held.values()):
         held[id(parts[-1])] = {parts[-1].keys[-1]}
-    kept = _select(sources, lambda part, key: key not in held[id(part)])
-    if not any(_shows_vehicle(part) for source in kept for part in source.sets):
+    kept = {id(part): set(part.keys) - held[id(part)] for part in parts}
+    training, testing = (_select(sources, keys) for keys in (kept, held))
+    if not any(_shows_vehicle(part) for source in training for part in source.sets):
         return list(sources), []
-    return kept, _select(sources, lambda part, key: key in held[id(part)])
+    return training, testing
 
 
 def _shows_vehicle(part: LabelledFrames) -> bool:
@@ -172,17 +173,13 @@ def _held_keys(keys: Sequence[FrameKey]) -> set[FrameKey]:
     return {key for number, key in enumerate(keys) if number // size % _EVERY == _HELD}
 
 
-def _select(
-    sources: Sequence[FrameDataset], wanted: Callable[[LabelledFrames, FrameKey], bool]
-) -> list[FrameDataset]:
-    """Return the data sets with some frames of each set; those without any are left out."""
-    chosen = []
-    for source in sources:
-        keys = [{key for key in part.keys if wanted(part, key)} for part in source.sets]
-        sets = tuple(select_frames(part, kept) for part, kept in zip(source.sets, keys) if kept)
-        if sets:
-            chosen.append(FrameDataset(source.name, sets))
-    return chosen
+def _select(sources: Sequence[FrameDataset], keys: Mapping[int, set[FrameKey]]) -> list[FrameDataset]:
+    """Return the data sets with some frames of each set, by its id; those without any are left out."""
+    sets = {
+        source.name: tuple(select_frames(part, keys[id(part)]) for part in source.sets if keys[id(part)])
+        for source in sources
+    }
+    return [FrameDataset(name, chosen) for name, chosen in sets.items() if chosen]
 
 
 def fingerprint(sources: Sequence[FrameDataset]) -> str:

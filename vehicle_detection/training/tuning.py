@@ -162,7 +162,7 @@ def compare_configurations(
     for value in values:
         check.number(value, "C")
     candidates = read_configurations(configurations, values)
-    parts: list[tuple[Any, Any, Any]] = list(_make_splits(patch_set, splits, _check_seeds(seeds)))
+    parts: list[Any] = list(_make_splits(patch_set, splits, _check_seeds(seeds)))
     trials, stored, rows = Trials(patch_set, options), RowStore(store, COLUMNS), []
     # Candidates with the same features follow each other: the cache computes them once.
     names = {name: place for place, name in enumerate(dict.fromkeys(each.name for each in candidates))}
