@@ -14,7 +14,7 @@ from tools import rides, train_default
 from tools.rendered import rendered_source
 from vehicle_detection.errors import DatasetError
 from vehicle_detection.network import load_network
-from vehicle_detection.training import NetworkTraining, export_network
+from vehicle_detection.training import NetworkTraining, export_network, set_metadata
 
 
 @pytest.fixture
@@ -42,15 +42,22 @@ def test_sources_of_the_data_folder(data):
         train_default.load_sources(data)
 
 
+@pytest.fixture(scope="module")
+def exported():
+    return export_network(random_network(), [], {}, {}, quantize=False)
+
+
 @pytest.fixture
-def quick(monkeypatch):
-    """Few rendered frames, small samples, and files with float weights."""
+def quick(monkeypatch, exported):
+    """Few rendered frames, small samples, and the file of one network, as exporting takes seconds."""
     small = functools.partial(NetworkTraining, batch=2, size=(96, 64), warm_up=1)
     monkeypatch.setattr(train_default, "NetworkTraining", small)
     monkeypatch.setattr(
         train_default, "rendered_source", lambda **options: rendered_source(frames=1, **options)
     )
-    monkeypatch.setattr(train_default, "export_network", functools.partial(export_network, quantize=False))
+    monkeypatch.setattr(
+        train_default, "export_network", lambda network, frames, *facts: set_metadata(exported, *facts)
+    )
     monkeypatch.setattr(train_default, "_INPUT_SIZE", 160)
     # The boxes of a network without training have no calibration.
     monkeypatch.setattr(train_default, "fit_log_odds", lambda folds: (2.0, 0.5))

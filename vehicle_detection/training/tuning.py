@@ -167,7 +167,8 @@ def compare_configurations(
     # Candidates with the same features follow each other: the cache computes them once.
     names = {name: place for place, name in enumerate(dict.fromkeys(each.name for each in candidates))}
     candidates.sort(key=lambda candidate: names[candidate.name])
-    plan = [(each, part) for each in candidates for part in ([(None, None, None)] if each.error else parts)]
+    none: list[Any] = [(None, None, None)]  # an impossible candidate has one row
+    plan = [(each, part) for each in candidates for part in (none if each.error else parts)]
     with progress_bar(progress, len(plan), unit="trial") as bar:
         for candidate, (name, seed, split) in plan:
             trial = trials.digest(candidate, split, seed)
