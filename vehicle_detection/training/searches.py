@@ -59,14 +59,11 @@ def compare_searches(
     check.instance(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
     check.instance(frames, "frames", LabelledFrames, "pass LabelledFrames(name, images, labels)")
     sets = [
-        [
-            check.number(side, "scales", low=0.25, high=20)
-            for side in check.sequence(each, "scales", "numbers")
-        ]
+        _check_numbers(each, "scales", 0.25, 20)
         for each in check.sequence(scales, "scales", "sets of numbers")
     ]
-    steps = _check_numbers(overlaps, "overlaps", 0.99)
-    limits = _check_numbers(thresholds, "thresholds", 1e9)
+    steps = _check_numbers(overlaps, "overlaps", 0, 0.99)
+    limits = _check_numbers(thresholds, "thresholds", 0, 1e9)
     rows = []
     for sides, overlap in itertools.product(sets, steps):
         bands = [
@@ -90,5 +87,6 @@ def compare_searches(
     return pd.DataFrame(rows).sort_values("f1", ascending=False, kind="stable", ignore_index=True)
 
 
-def _check_numbers(values: Sequence[float], name: str, high: float) -> list[float]:
-    return [check.number(each, name, low=0, high=high) for each in check.sequence(values, name, "numbers")]
+def _check_numbers(values: Sequence[float], name: str, low: float, high: float) -> list[float]:
+    listed = check.sequence(values, name, "numbers")
+    return [check.number(each, name, low=low, high=high) for each in listed]
