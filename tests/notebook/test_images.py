@@ -4,7 +4,7 @@ import pytest
 from tests.notebook.helpers import drawn_boxes, gray_image, new_axes, texts
 from vehicle_detection import notebook
 from vehicle_detection.boxes import Detections
-from vehicle_detection.notebook.style import OTHER, SKY, TRUTH, VEHICLE, evenly_spaced
+from vehicle_detection.notebook.style import OTHER, SKY, TRUTH, VEHICLE
 from vehicle_detection.tables import TrackTable
 
 
@@ -29,7 +29,7 @@ def test_images_have_titles_and_boxes():
 
 def test_patches_of_a_set_show_class_and_source(patch_set):
     axes = notebook.plot_patches(patch_set, count=8, columns=4, scores=np.arange(40.0), ax=new_axes())
-    rows = evenly_spaced(40, 8)
+    rows = np.linspace(0, 39, 8).round().astype(int)
     np.testing.assert_array_equal(axes.images[7].get_array(), patch_set.patches[39])
     assert texts(axes.texts)[0] == "Far\nscore +0.00"
     assert texts(axes.texts)[-1] == "Road\nscore +39.00"

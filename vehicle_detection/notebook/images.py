@@ -91,7 +91,8 @@ def plot_patches(
     classes = style.check_numbers(labels, "labels", len(images), "patches")
     texts = style.check_length(captions, "captions", len(images), "patches")
     values = style.check_numbers(scores, "scores", len(images), "patches")
-    rows = style.evenly_spaced(len(images), check.integer(count, "count", low=1, high=1000)).tolist()
+    shown = min(len(images), check.integer(count, "count", low=1, high=1000))
+    rows = np.linspace(0, len(images) - 1, shown).round().astype(np.intp).tolist()
     if not rows:
         raise InvalidInputError("patches must hold at least one patch; got none")
     tiles = []

@@ -54,12 +54,13 @@ def plot_precision_recall(
         x = np.linspace(level / (2 - level), 1, 100)
         axes.plot(x, level * x / (2 * x - level), color="0.85", linewidth=0.8, zorder=1)
         axes.annotate(f"F1 {level:g}", (1, x[0]), fontsize=7, color="0.5", ha="right", va="bottom")
-    for (name, (precision, recall, thresholds)), (color, dash) in zip(checked.items(), style.line_styles()):
+    for name, (precision, recall, thresholds) in checked.items():
         f1, best_threshold = best_f1(precision, recall, thresholds)
         best = int(np.argmax(thresholds == best_threshold))
         text = f"best F1 {f1:.2f} at {best_threshold:.2f}"
         label = f"{name}: {text}" if name else text
-        axes.plot(recall, precision, color=color, linestyle=dash, linewidth=1.8, label=label, zorder=3)
+        (line,) = axes.plot(recall, precision, linewidth=1.8, label=label, zorder=3)
+        color = line.get_color()
         axes.plot(recall[best], precision[best], "o", color=color, zorder=4)
         used = np.flatnonzero(thresholds > limit)
         if len(used):

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import functools
 import io
-import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Union
 
 import numpy as np
@@ -33,9 +32,6 @@ Color = tuple[float, float, float]
 COLORS: tuple[Color, ...] = tuple((r / 255, g / 255, b / 255) for r, g, b in TRACK_COLORS)
 """The track colors (Okabe and Ito), as RGB in [0, 1]."""
 
-LINE_COLORS: tuple[Color, ...] = tuple(COLORS[index] for index in (4, 5, 2, 6, 0, 1))
-"""The same colors without yellow, which is hard to see on white."""
-
 _, SKY, _, YELLOW, BLUE, VERMILION, _ = COLORS
 VEHICLE, OTHER = VERMILION, BLUE
 TRUTH = (1.0, 1.0, 1.0)
@@ -43,11 +39,6 @@ LINESTYLES = ("-", "--", "-.", ":")
 
 # Images whose longer side has at most this many pixels are shown without interpolation.
 _MAX_PIXELATED = 200
-
-
-def line_styles() -> Iterator[tuple[Color, str]]:
-    """Colors and line styles for consecutive lines; each combination is used before one repeats."""
-    return itertools.cycle((color, style) for style in LINESTYLES for color in LINE_COLORS)
 
 
 @functools.cache
@@ -203,11 +194,6 @@ def add_boxes(
         lines.set_path_effects([withStroke(linewidth=width + 1.2, foreground="black", alpha=0.5)])
     ax.add_collection(lines, autolim=False)
     return lines
-
-
-def evenly_spaced(count: int, max_rows: int) -> NDArray[np.intp]:
-    """At most `max_rows` evenly spaced row numbers out of `count`."""
-    return np.linspace(0, count - 1, min(count, max_rows)).round().astype(np.intp)
 
 
 def add_tiles(
