@@ -3,7 +3,6 @@ from matplotlib.figure import Figure, SubFigure
 
 from tests.notebook.helpers import gray_image, new_axes
 from vehicle_detection import notebook
-from vehicle_detection.boxes import Detections
 
 
 def test_figures_of_several_panels_are_not_managed_by_pyplot():
@@ -14,7 +13,7 @@ def test_figures_of_several_panels_are_not_managed_by_pyplot():
     assert notebook.show_images([gray_image()], figure=given) is given
     left, right = given.subfigures(1, 2)
     assert isinstance(left, SubFigure)
-    assert notebook.plot_heatmap(gray_image(), Detections.empty(), figure=right) is right
+    assert notebook.show_images([gray_image()], figure=right) is right
 
 
 def test_a_single_panel_uses_the_given_axes_or_a_pyplot_figure():

@@ -7,8 +7,6 @@ from .images import show_images as show_images
 from .quality import plot_errors as plot_errors
 from .quality import plot_precision_recall as plot_precision_recall
 from .quality import plot_tradeoff as plot_tradeoff
-from .search import plot_bands as plot_bands
-from .search import plot_heatmap as plot_heatmap
 from .tracks import plot_tracks as plot_tracks
 
 __all__: list[str]
