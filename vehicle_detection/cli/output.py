@@ -243,11 +243,7 @@ def output_folder(folder: Path | None, option: str) -> Iterator[None]:
         return
     common.check.path(folder, option, kind="a folder")
     created = [path for path in (folder, *folder.parents) if not path.exists()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        problem = f"{folder} cannot be created: {error.strerror}"
-        raise InvalidInputError(f"{option} must be a folder, {problem}; choose another") from error
+    common.make_folder(folder, option)
     try:
         if not os.access(folder, os.W_OK | os.X_OK):
             problem = f"{folder} is read-only; choose another"
