@@ -375,8 +375,7 @@ def _extract_batch(patches: NDArray[np.uint8], features: NDArray[np.float32], pa
         for row, patch in zip(spatial, converted[params.spatial_space].reshape(patches.shape)):
             params.spatial_planes(row)[:] = cv2.resize(patch, size).transpose(2, 0, 1)
     if params.hist_feat:
-        colors, bins = converted[params.hist_space].reshape(patches.shape), params.hist_bins
-        kernels.patch_histograms(colors, kernels.bin_of_value(bins), bins, hist)
+        hist[:] = kernels.count_bins(converted[params.hist_space], params.hist_bins, PATCH_SIZE)[..., 0]
         if params.hist_sqrt:
             np.sqrt(hist, out=hist)
     if params.hog_feat:

@@ -507,7 +507,7 @@ class BandFilters:
             for (weights, dilation), channels in zip(filters, maps):
                 kernels.add_correlation(channels, weights, dilation, scores[template])
         if self.hist_roots:
-            kernels.add_root_histograms(hist, self.bins, self.weights_by_bin, cell, side, scores)
+            kernels.add_root_histograms(hist, self.weights_by_bin, cell, side, scores)
         return scores[0] if len(scores) == 1 else np.asarray(scores.max(axis=0))
 
     def _hog_maps(self, source: NDArray[Any]) -> list[NDArray[np.float32]]:

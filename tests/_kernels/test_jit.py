@@ -10,13 +10,13 @@ from types import SimpleNamespace
 import pytest
 
 import vehicle_detection
-from vehicle_detection._kernels.features import value_counts
+from vehicle_detection._kernels.features import find_bins
 from vehicle_detection._kernels.jit import _Compilation, _save
 
 
 def test_compiling_kernels_is_logged_once_and_other_functions_are_not(caplog):
     compilation = _Compilation()
-    functions = logging.getLogger, value_counts, value_counts
+    functions = logging.getLogger, find_bins, find_bins
     with caplog.at_level(logging.INFO, "vehicle_detection._kernels"):
         for function in functions:
             dispatcher = SimpleNamespace(py_func=getattr(function, "py_func", function))
@@ -33,7 +33,7 @@ def test_a_kernel_that_cannot_be_kept_is_used(caplog):
     with caplog.at_level(logging.INFO, "vehicle_detection._kernels"):
         _save(save, None, None)
     assert "compiled kernels are not kept: [Errno 28] No space left on device" in caplog.text
-    assert value_counts._cache.save_overload.func is _save
+    assert find_bins._cache.save_overload.func is _save
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs the permissions of POSIX")
@@ -48,9 +48,9 @@ def test_a_read_only_installation_keeps_kernels_in_a_temporary_folder(tmp_path, 
     (temporary / f"vehicle-detection-kernels-{os.getuid()}").mkdir()
     (temporary / f"vehicle-detection-kernels-{os.getuid()}").chmod(mode)
     code = (
-        "import numpy as np; from vehicle_detection._kernels.features import value_counts;"
-        "value_counts(np.zeros((4, 4, 3), np.uint8), np.zeros((3, 256), int));"
-        "print(sum(value_counts.stats.cache_hits.values()) if value_counts._cache.cache_path else 0)"
+        "import numpy as np; from vehicle_detection._kernels.features import find_bins;"
+        "find_bins(np.zeros((4, 4, 3)), np.arange(3.0), np.zeros((4, 4, 3), np.intp));"
+        "print(sum(find_bins.stats.cache_hits.values()) if find_bins._cache.cache_path else 0)"
     )
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     environment |= {"PYTHONPATH": str(tmp_path), "HOME": "/dev/null/home", "TMPDIR": str(temporary)}
@@ -70,9 +70,9 @@ def test_a_change_of_another_kernel_file_is_noticed(tmp_path):
     copy = tmp_path / "vehicle_detection"
     shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__", "*.safetensors"))
     code = (
-        "import numpy as np; from vehicle_detection._kernels.features import value_counts;"
-        "value_counts(np.zeros((4, 4, 3), np.uint8), np.zeros((3, 256), int));"
-        "print(sum(value_counts.stats.cache_hits.values()))"
+        "import numpy as np; from vehicle_detection._kernels.features import find_bins;"
+        "find_bins(np.zeros((4, 4, 3)), np.arange(3.0), np.zeros((4, 4, 3), np.intp));"
+        "print(sum(find_bins.stats.cache_hits.values()))"
     )
 
     def hits():

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -70,137 +71,97 @@ def hog_cells(image: NDArray[Any], orient: int, cell: int, transform_sqrt: bool)
             )
         sum_orientations(*sqrt_gradients(image), degree_bounds(orient), channels, cell, cells)
     else:
-        flat = np.ascontiguousarray(image).reshape(height, -1)
-        sum_magnitudes(flat, channels, cell, orientation_cotangents(orient), cells)
+        _sum_magnitudes(image, cell, cells)
     return cells
 
 
-# Columns of a tile: its gradients and histograms (10 rows of floats) fit into the first-level cache.
+# Values of a row that are processed together: their gradients and sums (10 rows of floats) fit into the
+# first-level cache.
 _TILE = 768
 
 
+def _sum_magnitudes(image: NDArray[Any], cell: int, cells: NDArray[np.float32]) -> None:
+    """Fill `cells` with the gradient magnitudes of an image that is not square-rooted."""
+    _, width, channels = image.shape
+    orient = cells.shape[1]
+    # Mirrored: the gradient at the image's border is zero.
+    bordered = cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REFLECT_101).ravel()
+    bounds = np.full(-(-orient // 4) * 4 + 1, -np.inf, np.float32)
+    bounds[:orient] = orientation_cotangents(orient)
+    size = max(1, _TILE // (cell * channels)) * cell * channels
+    gradients, sums, fours = (np.empty((n, size), np.float32) for n in (2, len(bounds), orient))
+    stride = (width + 2) * channels
+    sum_magnitudes(bordered, stride, channels, cell, bounds, *gradients, sums, fours, cells)
+
+
 @jit
-def sum_magnitudes(image, channels, cell, cotangents, cells):
+def sum_magnitudes(image, stride, channels, cell, bounds, quotients, magnitudes, sums, fours, cells):
     """Sum gradient magnitudes into the orientation histograms of cells.
 
-    `image` is ``(H, W * channels)`` uint8 or float and at least as large as the cells, `cell` their side in
-    pixels, `cotangents` ``(orient,)`` float32 those of the orientations' lower bounds (infinite for the
-    first), and `cells` the output ``(channels, orient, cell rows, cell columns)`` float32, means over the
-    cells' pixels.
+    `image` is flat, with a border of a pixel and `stride` values in a row, `cell` the side of a cell in
+    pixels, `bounds` the cotangents of the orientations' lower bounds, from infinite to minus infinite, and
+    `cells` the output ``(channels, orient, cell rows, cell columns)`` float32, means over the cells' pixels.
+    The other arrays are memory for a tile: some cells of a row.
 
-    The reference is ``skimage.feature.hog``: central differences without halving, zero at the array's border,
-    unsigned orientation, hard binning. Orientation `k` starts at ``k * 180 / orient`` degrees; an angle in
-    (0, 180) is beyond that bound if ``gx / gy`` is at most its cotangent. This needs one division and no
-    arctangent, and is equal for opposite gradients. The quotients of integers up to 255 are too far from the
-    cotangents for rounding to matter; of floats, a gradient exactly on a bound may fall into the other bin.
-    Sums are cumulative over the bounds and differenced at the end.
+    The reference is ``skimage.feature.hog``: central differences without halving, unsigned orientation, hard
+    binning. Orientation `k` starts at ``k * 180 / orient`` degrees; an angle in (0, 180) is beyond that bound
+    if ``gx / gy`` is at most its cotangent. This needs one division and no arctangent, and is equal for
+    opposite gradients. The quotients of integers up to 255 are too far from the cotangents for rounding to
+    matter; of floats, a gradient exactly on a bound may fall into the other bin. Sums are cumulative over the
+    bounds and differenced at the end.
     """
     orient, rows, columns = cells.shape[1], cells.shape[2], cells.shape[3]
-    span = cell * channels
-    per_tile = max(1, _TILE // span)
-    size = per_tile * span
-    quotient, magnitude = np.empty(size, np.float32), np.empty(size, np.float32)
-    fours, eights = np.empty(size, np.float32), np.empty(size, np.float32)
-    reduced = np.zeros((orient + 1, channels, per_tile), np.float32)  # nothing is beyond the last bound
-    sums = np.empty((orient, size), np.float32)
-    scale = np.float32(1.0 / (cell * cell))
+    span, size = cell * channels, len(magnitudes)
+    zero, scale, total = np.float32(0), np.float32(1.0 / (cell * cell)), sums[0]
+    # Unsigned indices avoid the check for negative ones, which prevents vectors.
+    one, two, three = np.uintp(channels), np.uintp(2 * channels), np.uintp(3 * channels)
     for row in range(rows):
-        for first in range(0, columns, per_tile):
-            count = min(per_tile, columns - first)
-            start, n = first * span, count * span
-            sums.fill(np.float32(0))
+        for start in range(0, columns * span, size):
+            n = min(size, columns * span - start)
+            sums[:] = zero
             for y in range(row * cell, (row + 1) * cell):
-                _row_gradients(image, channels, y, start, n, quotient, magnitude)
-                _add_beyond_bounds(quotient, magnitude, cotangents, n, sums)
-            _sum_columns(sums, cell, channels, count, fours, eights, reduced)
-            for channel in range(channels):
+                left = np.uintp((y + 1) * stride + start)
+                above, below = np.uintp(y * stride + start), np.uintp((y + 2) * stride + start)
+                for i in range(np.uintp(n)):
+                    gx = np.float32(image[left + two + i]) - np.float32(image[left + i])
+                    gy = np.float32(image[below + one + i]) - np.float32(image[above + one + i])
+                    magnitude = np.sqrt(gx * gx + gy * gy)
+                    # A horizontal gradient has angle 0, for either sign.
+                    quotients[i] = gx / gy if gy != zero else np.float32(np.inf)
+                    magnitudes[i] = magnitude
+                    total[i] += magnitude
+                # Four bounds at a time: each loaded quotient is compared four times.
+                for k in range(1, orient, 4):
+                    b0, b1 = bounds[k], bounds[k + 1]
+                    b2, b3 = bounds[k + 2], bounds[k + 3]
+                    t0, t1 = sums[k], sums[k + 1]
+                    t2, t3 = sums[k + 2], sums[k + 3]
+                    for i in range(n):
+                        q, m = quotients[i], magnitudes[i]
+                        t0[i] += m if q <= b0 else zero
+                        t1[i] += m if q <= b1 else zero
+                        t2[i] += m if q <= b2 else zero
+                        t3[i] += m if q <= b3 else zero
+            # Sums of four columns at every position: adjacent values, unlike the columns of a cell, are added
+            # as vectors.
+            source, parts, jump = sums, cell, one
+            if cell % 4 == 0:
+                source, parts, jump = fours, cell // 4, np.uintp(4 * channels)
                 for k in range(orient):
-                    out = cells[channel, k, row, first : first + count]
-                    within, past = reduced[k, channel], reduced[k + 1, channel]
-                    for column in range(count):
-                        out[column] = (within[column] - past[column]) * scale
-
-
-@jit
-def _row_gradients(image, channels, y, start, n, quotient, magnitude):
-    """Write ``gx / gy`` and the magnitude of the gradients of `n` values of row `y`, from `start`."""
-    height, width = image.shape
-    zero, infinite = np.float32(0), np.float32(np.inf)
-    # The gradient at the array's border is zero.
-    low = channels if start == 0 else 0
-    high = n - channels if start + n == width else n
-    inside = 0 < y < height - 1
-    above = image[y - 1 if inside else y, start : start + n]
-    below = image[y + 1 if inside else y, start : start + n]
-    left = image[y, start + low - channels : start + high - channels]
-    right = image[y, start + low + channels : start + high + channels]
-    quotient[:low] = zero
-    quotient[high:n] = zero
-    inner = quotient[low:high]
-    for i in range(high - low):
-        inner[i] = np.float32(right[i]) - np.float32(left[i])
-    for i in range(n):
-        gx = quotient[i]
-        gy = np.float32(below[i]) - np.float32(above[i])
-        magnitude[i] = np.sqrt(gx * gx + gy * gy)
-        # A horizontal gradient has angle 0, for either sign.
-        quotient[i] = gx / gy if gy != zero else infinite
-
-
-@jit
-def _add_beyond_bounds(quotient, magnitude, cotangents, n, sums):
-    """Add each magnitude to ``sums[k]`` for every bound `k` that its angle is beyond."""
-    orient, zero = len(cotangents), np.float32(0)
-    total = sums[0]
-    for i in range(n):
-        total[i] += magnitude[i]
-    # Four bounds at a time: each loaded quotient is compared four times.
-    single = 1 + (orient - 1) // 4 * 4
-    for k in range(1, single, 4):
-        c0, c1 = cotangents[k], cotangents[k + 1]
-        c2, c3 = cotangents[k + 2], cotangents[k + 3]
-        t0, t1, t2, t3 = sums[k], sums[k + 1], sums[k + 2], sums[k + 3]
-        for i in range(n):
-            q, m = quotient[i], magnitude[i]
-            t0[i] += m if q <= c0 else zero
-            t1[i] += m if q <= c1 else zero
-            t2[i] += m if q <= c2 else zero
-            t3[i] += m if q <= c3 else zero
-    for k in range(single, orient):
-        c0, t0 = cotangents[k], sums[k]
-        for i in range(n):
-            t0[i] += magnitude[i] if quotient[i] <= c0 else zero
-
-
-@jit
-def _sum_columns(sums, cell, channels, count, fours, eights, reduced):
-    """Sum the columns of `count` cells: ``reduced[k, channel, column]`` from rows of sums ``(orient, n)``.
-
-    First the sums of four and of eight columns at every position, of which one for each cell is used:
-    adjacent values, unlike the columns of a cell, are added as vectors.
-    """
-    span = cell * channels
-    ahead = (count * cell - 3) * channels
-    for k in range(len(sums)):
-        total = sums[k]
-        single, step = total, 1
-        if cell % 4 == 0:
-            s1, s2, s3 = total[channels:], total[2 * channels :], total[3 * channels :]
-            for i in range(ahead):
-                fours[i] = (total[i] + s1[i]) + (s2[i] + s3[i])
-            single, step = fours, 4
-            if cell % 8 == 0:
-                other = fours[4 * channels :]
-                for i in range(ahead - 4 * channels):
-                    eights[i] = fours[i] + other[i]
-                single, step = eights, 8
-        for channel in range(channels):
-            for column in range(count):
-                at = column * span + channel
-                value = single[at]
-                for x in range(step, cell, step):
-                    value += single[at + x * channels]
-                reduced[k, channel, column] = value
+                    t0 = sums[k]
+                    for i in range(np.uintp(n) - three):
+                        fours[k, i] = (t0[i] + t0[i + one]) + (t0[i + two] + t0[i + three])
+            for column in range(n // span):
+                for channel in range(channels):
+                    past = zero  # nothing is beyond the last bound
+                    for k in range(orient - 1, -1, -1):
+                        at = np.uintp(column * span + channel)
+                        within = source[k, at]
+                        for _ in range(1, parts):
+                            at += jump
+                            within += source[k, at]
+                        cells[channel, k, row, start // span + column] = (within - past) * scale
+                        past = within
 
 
 @jit
@@ -238,102 +199,111 @@ def pool_cells(cells: NDArray[np.float32]) -> NDArray[np.float32]:
     zero.
     """
     pooled = np.zeros_like(cells)
-    pairs = cells[..., :-1] + cells[..., 1:]
-    pooled[..., :-1, :-1] = (pairs[..., :-1, :] + pairs[..., 1:, :]) * np.float32(0.25)
+    columns, flat, sums = cells.shape[-1], cells.reshape(-1), pooled.reshape(-1)
+    # Adjacent values are added as vectors, also across the ends of rows, which are cleared then.
+    pairs = flat[:-1] + flat[1:]
+    np.add(pairs[:-columns], pairs[columns:], out=sums[: -columns - 1])
+    pooled *= np.float32(0.25)
+    pooled[..., -1:, :], pooled[..., -1] = 0, 0
     return pooled
 
 
 def hog_blocks(cells: NDArray[np.float32], block: int, dilation: int = 1) -> NDArray[np.float32]:
-    """Normalize the blocks that start at each cell: ``(channels, block, block, orient, rows, columns)``."""
-    channels, orient, rows, columns = cells.shape
-    blocks = np.empty((channels, block, block, orient, rows, columns), np.float32)
-    normalize_blocks(cells, block, dilation, blocks)
-    return blocks
-
-
-@jit
-def normalize_blocks(cells, block, dilation, blocks):
     """Normalize overlapping blocks of cells by L2-Hys: L2, clip at 0.2, L2 again.
 
-    `block` is the side of a block in cells and `dilation` the distance of its cells: 1, or 2 for
-    pooled ones. `blocks` is the output ``(channels, block, block, orient, cell rows, cell columns)``
-    float32: ``blocks[c, i, j, k, y, x]`` is the value of cell ``[y + i * dilation, x + j * dilation]`` in the
-    block that starts at cell ``[y, x]``. The last ``(block - 1) * dilation`` rows and columns start no block
-    and are zero.
+    `block` is the side of a block in cells and `dilation` the distance of its cells: 1, or 2 for pooled ones.
+    Returns ``(channels, block, block, orient, cell rows, cell columns)`` float32:
+    ``blocks[c, i, j, k, y, x]`` is the value of cell ``[y + i * dilation, x + j * dilation]`` in the block
+    that starts at cell ``[y, x]``.
+    The last ``(block - 1) * dilation`` rows and columns start no block and are zero.
 
     Dalal and Triggs, "Histograms of oriented gradients for human detection" (CVPR 2005), section 6.4, with
     the constants of scikit-image.
     """
     channels, orient, rows, columns = cells.shape
+    blocks = np.empty((channels, block, block, orient, rows, columns), np.float32)
     height, width = rows - (block - 1) * dilation, columns - (block - 1) * dilation
-    eps, clip, one = np.float32(1e-10), np.float32(0.2), np.float32(1)
-    energy = np.empty((rows, columns), np.float32)
-    scale = np.empty(width, np.float32)
-    clipped = np.empty(width, np.float32)
-    blocks[:, :, :, :, height:] = 0
-    for channel in range(channels):
-        energy.fill(np.float32(0))
-        for k in range(orient):
-            for y in range(rows):
-                line = cells[channel, k, y]
-                sums = energy[y]
-                for x in range(columns):
-                    sums[x] += line[x] * line[x]
-        for y in range(height):
-            scale.fill(eps)
-            for i in range(block):
-                for j in range(block):
-                    line = energy[y + i * dilation, j * dilation : j * dilation + width]
-                    for x in range(width):
-                        scale[x] += line[x]
-            for x in range(width):
-                scale[x] = one / np.sqrt(scale[x])
-            clipped.fill(eps)
-            for i in range(block):
-                for j in range(block):
-                    for k in range(orient):
-                        line = cells[channel, k, y + i * dilation, j * dilation : j * dilation + width]
-                        out = blocks[channel, i, j, k, y]
-                        for x in range(width):
-                            value = min(line[x] * scale[x], clip)
-                            out[x] = value
-                            clipped[x] += value * value
-            for x in range(width):
-                clipped[x] = one / np.sqrt(clipped[x])
-            for i in range(block):
-                for j in range(block):
-                    for k in range(orient):
-                        out = blocks[channel, i, j, k, y]
-                        for x in range(width):
-                            out[x] *= clipped[x]
-                        out[width:].fill(np.float32(0))
+    blocks[..., height:, :], blocks[..., width:] = 0, 0
+    flat, flat_blocks = cells.reshape(channels, orient, -1), blocks.reshape(channels, -1, rows * columns)
+    energy, memory = np.empty(rows * columns, np.float32), np.empty((2, width), np.float32)
+    normalize_blocks(flat, block, dilation, height, columns, energy, *memory, flat_blocks)
+    return blocks
 
 
 @jit
-def value_counts(image, counts):
-    """Count the values of each channel: `image` ``(H, W, 3)`` uint8, `counts` ``(3, 256)`` output."""
-    counts[:] = 0
-    for y in range(image.shape[0]):
-        for x in range(image.shape[1]):
-            counts[0, image[y, x, 0]] += 1
-            counts[1, image[y, x, 1]] += 1
-            counts[2, image[y, x, 2]] += 1
+def normalize_blocks(cells, block, dilation, height, columns, energy, scale, squares, blocks):
+    """Normalize `height` rows of blocks; see `hog_blocks`.
 
-
-@jit
-def patch_histograms(patches, bin_of_value, bins, features):
-    """Color histograms of ``(N, side, side, 3)`` uint8 patches, channel by channel.
-
-    `bin_of_value` is ``(256,)`` intp, and `features` the output ``(N, 3 * bins)`` float32.
+    `cells` is ``(channels, orient, n)`` and `blocks` the output ``(channels, block * block * orient, n)``,
+    with the rows of cells one after the other. The arrays between them are memory for one channel and for one
+    row.
     """
-    counts = np.empty((3, 256), np.int64)
-    for index in range(len(patches)):
-        value_counts(patches[index], counts)
-        out = features[index]
-        out[:] = 0
-        for channel in range(3):
-            for value in range(256):
-                out[channel * bins + bin_of_value[value]] += counts[channel, value]
+    orient, width = cells.shape[1], np.uintp(len(scale))
+    zero, one, eps, clip = np.float32(0), np.float32(1), np.float32(1e-10), np.float32(0.2)
+    for channel in range(cells.shape[0]):
+        energy[:] = zero
+        for k in range(orient):
+            values = cells[channel, k]
+            for i in range(len(values)):
+                energy[i] += values[i] * values[i]
+        for y in range(height):
+            start = np.uintp(y * columns)
+            squares[:] = eps
+            for cell in range(block * block):
+                at = np.uintp((y + cell // block * dilation) * columns + cell % block * dilation)
+                for x in range(width):
+                    squares[x] += energy[at + x]
+            for x in range(width):
+                scale[x] = one / np.sqrt(squares[x])
+            squares[:] = eps
+            for index in range(blocks.shape[1]):
+                cell = index // orient
+                values, out = cells[channel, index % orient], blocks[channel, index]
+                at = np.uintp((y + cell // block * dilation) * columns + cell % block * dilation)
+                for x in range(width):
+                    value = values[at + x] * scale[x]
+                    value = value if value < clip else clip
+                    out[start + x] = value
+                    squares[x] += value * value
+            for x in range(width):
+                scale[x] = one / np.sqrt(squares[x])
+            for index in range(blocks.shape[1]):
+                out = blocks[channel, index]
+                for x in range(width):
+                    out[start + x] *= scale[x]
+
+
+def count_bins(image: NDArray[np.uint8], bins: int, cell: int) -> NDArray[np.uint16]:
+    """Color histograms of an image's cells: ``(cell rows, 3 * bins, cell columns)``.
+
+    `image` is ``(H, W, 3)``, and `cell` the side of a cell, at most 255 pixels.
+    """
+    rows, columns = image.shape[0] // cell, image.shape[1] // cell
+    counts = np.zeros((rows, 3 * bins, columns), np.uint16)
+    # Unsigned indices avoid the check for negative ones.
+    starts = ((np.arange(3)[:, None] * bins + bin_of_value(bins)) * columns).astype(np.uintp)
+    add_counts(image, starts, cell, columns, counts.reshape(rows, -1))
+    return counts
+
+
+@jit
+def add_counts(image, starts, cell, columns, counts):
+    """Count the values of cells by bin, in place.
+
+    `counts` is ``(cell rows, 3 * bins * columns)``, bin after bin, and `starts` ``(3, 256)`` where the counts
+    of a channel's value start.
+    """
+    one = np.uint16(1)
+    for row in range(counts.shape[0]):
+        out = counts[row]
+        for y in range(row * cell, (row + 1) * cell):
+            line = image[y]
+            for column in range(columns):
+                offset = np.uintp(column)
+                for x in range(column * cell, (column + 1) * cell):
+                    out[starts[0, line[x, 0]] + offset] += one
+                    out[starts[1, line[x, 1]] + offset] += one
+                    out[starts[2, line[x, 2]] + offset] += one
 
 
 @jit
@@ -381,120 +351,71 @@ def histogram_cells(image, table, cell, cells):
                 cells[row, column] += first + second + third
 
 
-@jit
-def add_root_histograms(image, bin_of_value, weights, cell, window, scores):
+def add_root_histograms(
+    image: NDArray[np.uint8],
+    weights: NDArray[np.float32],
+    cell: int,
+    window: int,
+    scores: NDArray[np.float32],
+) -> None:
     """Add, to each window's score, the weighted square roots of its histogram's counts, in place.
 
-    `image` is ``(H, W, 3)`` uint8, `bin_of_value` ``(256,)`` intp, `weights` ``(templates, 3, bins)``
-    float32, `cell` the side of a cell in pixels, `window` the side of a window in cells (a power of two, at
-    most 64 pixels), and `scores` ``(templates, cell rows - window + 1, cell columns - window + 1)`` float32.
-
-    The counts of the last `window` rows of cells are stored by bin, summed over the width of a window: moving
-    down by a row of cells adds one row and subtracts another. Bins without a pixel in those rows, which are
-    most of them, are skipped.
+    `image` is ``(H, W, 3)``, `weights` ``(templates, 3, bins)``, `cell` the side of a cell in pixels,
+    `window` the side of a window in cells (a power of two, at most 64 pixels), and `scores`
+    ``(templates, cell rows - window + 1, cell columns - window + 1)``.
     """
-    templates, bins = len(weights), weights.shape[2]
-    rows, width = scores.shape[1] + window - 1, scores.shape[2]
-    columns = width + window - 1
-    # A window has at most 64x64 pixels, so 16 bits are enough.
-    counts = np.empty((3 * bins, columns), np.uint16)
-    flat = counts.reshape(-1)
-    # Start of each bin's counts. Unsigned indices avoid the check for negative ones.
-    starts = np.empty((3, 256), np.uintp)
-    for channel in range(3):
-        for value in range(256):
-            starts[channel, value] = (channel * bins + bin_of_value[value]) * columns
-    wide = np.empty(columns, np.uint16)
-    recent = np.zeros((window, 3 * bins, width), np.uint16)
-    filled = np.zeros((window, 3 * bins), np.bool_)
-    sums = np.zeros((3 * bins, width), np.uint16)
-    roots = np.empty(width, np.float32)
-    flat_weights = weights.reshape(templates, 3 * bins)
-    for row in range(rows):
-        counts.fill(np.uint16(0))
-        for y in range(row * cell, (row + 1) * cell):
-            _count_by_bin(image[y], starts, cell, columns, flat)
-        slot = row % window
-        for k in range(3 * bins):
-            count = counts[k]
-            any_count = np.uint16(0)
-            for x in range(columns):
-                any_count |= count[x]
-            total, last = sums[k], recent[slot, k]
-            if filled[slot, k]:
-                for x in range(width):
-                    total[x] -= last[x]
-            filled[slot, k] = any_count > 0
-            if any_count > 0:
-                _sum_windows(count, window, wide)
-                for x in range(width):
-                    last[x] = count[x]
-                    total[x] += count[x]
-            used = False
-            for i in range(window):
-                used |= filled[i, k]
-            if used and row >= window - 1:
-                for x in range(width):
-                    roots[x] = np.sqrt(np.float32(total[x]))
-                for template in range(templates):
-                    weight = flat_weights[template, k]
-                    out = scores[template, row - window + 1]
-                    for x in range(width):
-                        out[x] += weight * roots[x]
+    counts = count_bins(image, weights.shape[2], cell)
+    spans = [2**power for power in range(window.bit_length() - 1)]
+    for span in spans:  # of two rows of cells, of four and so on
+        counts = counts[:-span] + counts[span:]
+    for span in spans:
+        counts = counts[..., :-span] + counts[..., span:]
+    add_roots(counts, weights.reshape(len(weights), -1), scores)
 
 
 @jit
-def _count_by_bin(line, starts, cell, columns, counts):
-    """Count the values of a row of pixels ``(W, 3)`` by bin and cell; `counts` holds bin after bin."""
-    first, second, third = starts[0], starts[1], starts[2]
-    one = np.uint16(1)
-    for column in range(columns):
-        offset = np.uintp(column)
-        for x in range(column * cell, (column + 1) * cell):
-            counts[first[line[x, 0]] + offset] += one
-            counts[second[line[x, 1]] + offset] += one
-            counts[third[line[x, 2]] + offset] += one
+def add_roots(counts, weights, scores):
+    """Add weighted square roots of counts ``(rows, bins, columns)`` to ``scores[template, row, column]``."""
+    for template in range(scores.shape[0]):
+        for row in range(scores.shape[1]):
+            out = scores[template, row]
+            for k in range(counts.shape[1]):
+                weight, line = weights[template, k], counts[row, k]
+                for x in range(out.shape[0]):
+                    out[x] += weight * np.sqrt(np.float32(line[x]))
 
 
-@jit
-def _sum_windows(count, window, wide):
-    """Sum the counts of `window` cells from each cell on, in place: of two cells, of four and so on."""
-    span = 1
-    while span < window:
-        reach = len(count) - span
-        left, right = count[:reach], count[span:]
-        for x in range(reach):
-            wide[x] = left[x] + right[x]
-        for x in range(reach):
-            left[x] = wide[x]
-        span *= 2
+def add_correlation(
+    channels: NDArray[np.float32], weights: NDArray[np.float32], dilation: int, scores: NDArray[np.float32]
+) -> None:
+    """Add each window's weighted sum of channels to its score, in place.
+
+    `channels` is ``(channels, rows, columns)``, `weights` ``(window rows, window columns, channels)``, and
+    `scores` has a row and a column for each position of the window. Neighboring cells of a window are
+    `dilation` cells apart.
+    """
+    if missing := -len(channels) % 4:
+        channels = np.concatenate([channels, np.zeros((missing, *channels.shape[1:]), np.float32)])
+        weights = np.pad(weights, ((0, 0), (0, 0), (0, missing)))
+    correlate(channels, weights, dilation, scores)
 
 
 @functools.partial(jit, reorder=True)
-def add_correlation(channels, weights, dilation, scores):
-    """Add each window's weighted sum of channels to its score, in place.
+def correlate(channels, weights, dilation, scores):
+    """Add the correlation of a number of channels that is a multiple of 4; see `add_correlation`.
 
-    `channels` is ``(channels, rows, columns)``, `weights` ``(window rows, window columns, channels)``, both
-    float32, and `scores` has a row and a column for each position of the window. Neighboring cells of a
-    window are `dilation` cells apart. Four channels are added at a time, so that a score is loaded and stored
-    once for four products, and all columns of the weights before the next channels, which stay in the cache.
+    Four channels are added at a time, so that a score is loaded and stored once for four products, and all
+    columns of the weights before the next channels, which stay in the cache.
     """
-    depth, (height, width) = channels.shape[0], scores.shape
-    whole = depth - depth % 4
-    for y in range(height):
+    for y in range(scores.shape[0]):
         out = scores[y]
         for row in range(weights.shape[0]):
             line = y + row * dilation
-            for k in range(0, whole, 4):
+            for k in range(0, channels.shape[0], 4):
                 for column in range(weights.shape[1]):
-                    x, w = column * dilation, weights[row, column, k : k + 4]
+                    x, w = column * dilation, weights[row, column, k:]
                     w0, w1, w2, w3 = w[0], w[1], w[2], w[3]
                     v0, v1 = channels[k, line, x:], channels[k + 1, line, x:]
                     v2, v3 = channels[k + 2, line, x:], channels[k + 3, line, x:]
-                    for i in range(width):
+                    for i in range(out.shape[0]):
                         out[i] += (w0 * v0[i] + w1 * v1[i]) + (w2 * v2[i] + w3 * v3[i])
-            for k in range(whole, depth):
-                for column in range(weights.shape[1]):
-                    weight, values = weights[row, column, k], channels[k, line, column * dilation :]
-                    for i in range(width):
-                        out[i] += weight * values[i]
