@@ -526,7 +526,8 @@ def track(
             jobs=jobs,
             interval=interval,
             delay=0 if opened.live or params is None else search_delay(params, fps, interval),
-            lookahead=max(jobs, ahead) + 1,
+            # A live source may send many frames at once at first, which would grow old in a long queue.
+            lookahead=max(jobs - 1, 1) if opened.live else max(jobs, ahead) + 1,
             frames=frames,
             reduction=reduction,
         )
