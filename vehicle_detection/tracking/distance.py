@@ -42,6 +42,8 @@ _HEIGHT_STD, _HEIGHT_CHANGE = 1.0, 0.1
 # Times (s) in which the width's prior variance is added to its process noise, and over which the error of the
 # horizon (pitch and hills), and other errors that successive frames share, are correlated.
 _WIDTH_TIME, _PITCH_TIME, _SHARED_TIME = 20.0, 1.0, 2.0
+# Error of the rate of a growth (1/s) that successive frames share.
+_GROWTH_BIAS = 0.01
 # Mean innovation of an edge (standard errors) above which a distance is uncertain, and the relative error
 # that it then gains (per square root of a second).
 _UNSETTLED, _UNSETTLED_STD = 2.0, 0.5
@@ -119,13 +121,15 @@ class _View(NamedTuple):
 def update_distances(
     states: KalmanStates, measured: Measurements, camera: Camera, dt: float, correlation_time: float
 ) -> KalmanStates:
-    """Correct distances by the bottom edge, the width and the height of boxes (extended Kalman filter).
+    """Correct distances by the growth, bottom edge, width and height of boxes (extended Kalman filter).
 
     The errors of a vehicle's boxes are correlated over `correlation_time` seconds.
     """
     mean, cov = states.range_mean.copy(), states.range_cov.copy()
     _loosen(mean, cov, states, measured, dt)
     view = _view(mean, measured, camera, dt, correlation_time)
+    if measured.growth is not None:
+        mean, cov = _correct_by_growth(mean, cov, *measured.growth.T, camera, dt)
     view = _start(mean, cov, view, camera)
     mean, cov = _correct_by_bottom(mean, cov, view, camera)
     np.clip(mean[:, DISTANCE], _MIN_DISTANCE, _MAX_DISTANCE, out=mean[:, DISTANCE])
@@ -207,6 +211,24 @@ def _start(mean: Floats, cov: Floats, view: _View, camera: Camera) -> _View:
     mean[known, DISTANCE] = first[known]
     sees_bottom, sees_height = view.sees_bottom & (is_better | ~unknown), view.sees_height & ~unknown
     return view._replace(sees_bottom=sees_bottom, sees_height=sees_height)
+
+
+def _correct_by_growth(
+    mean: Floats, cov: Floats, growth: Floats, std: Floats, camera: Camera, dt: float
+) -> tuple[Floats, Floats]:
+    """Correct by the logarithm of the growth since the last frame, ``(x - dt * speed) / x`` of `x` to the end.
+
+    The pixels that are followed lie between the nearest part and the tires.
+    """
+    far = mean[:, DISTANCE] + camera.overhang_m / 2
+    before = np.maximum(far - dt * mean[:, SPEED], 0.1 * far)
+    jacobian = np.zeros_like(mean)
+    jacobian[:, DISTANCE], jacobian[:, SPEED] = 1 / before - 1 / far, -dt / before
+    shared = np.square(_GROWTH_BIAS * dt) * max(1.0, _SHARED_TIME / dt)
+    known = np.isfinite(std) & (cov[:, DISTANCE, DISTANCE] < _INITIAL_DISTANCE_STD**2 / 2)
+    return _scalar_update(
+        mean, cov, jacobian, growth - np.log(before / far), np.where(known, np.square(std) + shared, np.inf)
+    )
 
 
 def _correct_by_bottom(mean: Floats, cov: Floats, view: _View, camera: Camera) -> tuple[Floats, Floats]:

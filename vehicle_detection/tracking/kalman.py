@@ -107,6 +107,7 @@ class Measurements(NamedTuple):
     unsure: Bools  # (N,) whether the box has a low score, so that it may show something else too
     covered: Floats  # (N,) fraction of the box that nearer vehicles cover
     hidden: Bools  # (N, 4) edges beyond which a nearer vehicle hides what follows
+    growth: Floats | None = None  # (N, 2) logarithm of the growth since the last frame, and its error
 
     @classmethod
     def from_boxes(

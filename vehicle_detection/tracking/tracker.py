@@ -13,6 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -44,6 +45,7 @@ from vehicle_detection.tracking.distance import (
     predict_distances,
     update_distances,
 )
+from vehicle_detection.tracking.growth import Gray, measure_growth
 from vehicle_detection.tracking.horizon import HorizonFilter
 from vehicle_detection.tracking.kalman import (
     OUTWARD,
@@ -147,6 +149,7 @@ class Tracker:
         self._live: list[TrackState] = []  # confirmed tracks by id, then tentative ones
         self._states = KalmanStates.empty()
         self._at_start = True
+        self._gray: Gray | None = None  # the last frame
         self._tracks: tuple[Track, ...] = ()
 
     def follows(self, shape: tuple[int, ...], time: float | None = None) -> bool:
@@ -163,6 +166,7 @@ class Tracker:
         time: float | None = None,
         frames: int = 1,
         cut: bool = False,
+        gray: Gray | None = None,
     ) -> tuple[Track, ...]:
         """Process the detections of the next frame; return confirmed tracks by id, then tentative ones.
 
@@ -175,6 +179,8 @@ class Tracker:
             Time of the frame in seconds, by default `frames` frames after the last. A frame with the same
             time as the last one changes nothing. An earlier time, a gap of more than ``params.max_gap`` and
             another `shape` end all tracks, as does `cut`, the beginning of another scene (`SceneCuts`).
+        gray
+            The frame in gray and small (`small_gray`), from which speeds are measured more exactly.
         """
         if hasattr(detections, "xyxy"):
             detections = Detections.from_supervision(detections)
@@ -191,15 +197,16 @@ class Tracker:
         unassigned = np.ones(len(found), np.bool_)
         if self._live:
             coasting = np.array([track.misses > 0 for track in self._live])
+            before = self._states.boxes()
             states = self._smoother.predict(self._states, coasting, dt)
             self._states = predict_distances(states, dt, self.camera)
-            unassigned = self._correct(found, frame, dt)
+            unassigned = self._correct(found, frame, dt, before, gray)
             self._end_lost_tracks(frame, dt)
             self._end_parts(frame)
         self._start(found[unassigned], frame, dt)
         self._confirm(frame)
         self._update_horizon(frame, dt)
-        self._tracks, self._at_start = self._snapshot(frame, self._states), False
+        self._tracks, self._at_start, self._gray = self._snapshot(frame, self._states), False, gray
         return self._tracks
 
     def _limit(self, found: Detections) -> Detections:
@@ -261,7 +268,9 @@ class Tracker:
         self._time, self._shape = now, frame
         return dt
 
-    def _correct(self, found: Detections, frame: FrameShape, dt: float) -> NDArray[np.bool_]:
+    def _correct(
+        self, found: Detections, frame: FrameShape, dt: float, before: Floats, gray: Gray | None
+    ) -> NDArray[np.bool_]:
         """Correct the tracks by their detections; return which detections belong to no track."""
         boxes, scores = found.boxes, found.scores
         unassigned = np.ones(len(boxes), np.bool_)
@@ -287,10 +296,32 @@ class Tracker:
         unsure = [track.id > 0 and low[source[row]] for row, track in zip(rows, tracks)]
         hidden = hidden_edges(boxes, predicted, rows, in_front)
         measured = Measurements.from_boxes(boxes, frame, is_merged, self._lens, covered[rows], hidden, unsure)
+        measured = measured._replace(growth=self._growth(tracks, measured, before[rows], frame, gray))
         states = self._smoother.correct(self._states.take(rows), tracks, measured, dt)
         states = update_distances(states, measured, self.camera, dt, self.params.measurement_correlation_time)
         self._states = self._states.put(rows, states)
         return unassigned
+
+    def _growth(
+        self,
+        tracks: Sequence[TrackState],
+        measured: Measurements,
+        before: Floats,
+        frame: FrameShape,
+        gray: Gray | None,
+    ) -> Floats | None:
+        """Growth of tracks since the last frame, in which they had the boxes `before`; see `Measurements`."""
+        if gray is None or self._gray is None or gray.shape != self._gray.shape:
+            return None
+        result = np.tile([0.0, np.inf], (len(tracks), 1))
+        seen = np.array([track.last_gap == 0 and track.hits > 1 for track in tracks])
+        rows = np.flatnonzero(
+            seen & ~measured.merged & (measured.covered == 0) & ~measured.truncated[:, [0, 2]].any(axis=1)
+        )
+        scale = gray.shape[1] / frame[1]
+        growth, std = measure_growth(self._gray, gray, scale * before[rows], scale * measured.boxes[rows])
+        result[rows, 0], result[rows, 1] = growth, std
+        return result
 
     def _assign(
         self, boxes: Floats, scores: Floats, frame: FrameShape
