@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import functools
 import os
 import threading
@@ -36,7 +37,7 @@ from vehicle_detection.regions import RegionParams, find_vehicles
 from vehicle_detection.results import ImageDetections, image_distances
 from vehicle_detection.search import FrameSearch, SearchResult
 from vehicle_detection.svm import VehicleClassifier, load_classifier
-from vehicle_detection.tracking import FrameResult, SceneCuts, Tracker, TrackParams
+from vehicle_detection.tracking import FrameResult, SceneCuts, Tracker, TrackParams, small_gray
 
 Image = NDArray[np.uint8]
 Path = str | os.PathLike[str]
@@ -469,7 +470,7 @@ class VehicleDetector(Closing):
 
     def search(self, frame: Image) -> SearchResult:
         """Search a frame, as `Detector.search`; needs no other frame, and is thread-safe."""
-        return self.detector.search(frame)
+        return dataclasses.replace(self.detector.search(frame), gray=small_gray(frame))
 
     def reduction(self, shape: tuple[int, ...]) -> int:
         """Whole factor by which the search reduces frames of this shape first, as `Detector.reduction`."""
@@ -549,7 +550,8 @@ class VehicleDetector(Closing):
             self.heat = self._heat_history.add(frame_heat(found.shape, found.windows, heat_params))
             detections = label_heat(self.heat, heat_params)
         detected = clock.thread_time()
-        tracks = self.tracker.update(detections, found.shape, time=time, frames=frames, cut=cut)
+        when: Any = {"time": time, "frames": frames, "cut": cut}
+        tracks = self.tracker.update(detections, found.shape, gray=found.gray, **when)
         tracked = clock.thread_time()
         seconds = {"search": found.seconds, "regions": detected - start, "track": tracked - detected}
         self._index, self._skipped = self._index + frames, 0

@@ -264,6 +264,8 @@ class SearchResult:
         are kept for tracking only.
     shape, seconds
         ``(height, width)`` of the frame, and the duration of the search.
+    gray
+        The frame in gray, at most 640 pixels long, from which a tracker measures speeds; None without one.
 
     Examples
     --------
@@ -277,6 +279,7 @@ class SearchResult:
     vehicles: Detections | None
     shape: tuple[int, int]
     seconds: float
+    gray: NDArray[np.uint8] | None = None
 
     def enlarged(self, factor: int) -> Self:
         """Return the result for a frame that was reduced by a whole factor before the search."""

@@ -1,5 +1,6 @@
 """Tracking: detections of single frames in, vehicles with constant identities out."""
 
+from vehicle_detection.tracking.growth import small_gray
 from vehicle_detection.tracking.horizon import HorizonEstimate, estimate_horizon
 from vehicle_detection.tracking.interpolation import (
     backfill_results,
@@ -35,4 +36,5 @@ __all__ = [
     "search_delay",
     "search_interval",
     "shown_tracks",
+    "small_gray",
 ]

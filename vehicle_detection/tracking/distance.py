@@ -216,7 +216,7 @@ def _start(mean: Floats, cov: Floats, view: _View, camera: Camera) -> _View:
 def _correct_by_growth(
     mean: Floats, cov: Floats, growth: Floats, std: Floats, camera: Camera, dt: float
 ) -> tuple[Floats, Floats]:
-    """Correct by the logarithm of the growth since the last frame, ``(x - dt * speed) / x`` of `x` to the end.
+    """Correct by the logarithm of the growth since the last frame: that of the distance before over now.
 
     The pixels that are followed lie between the nearest part and the tires.
     """

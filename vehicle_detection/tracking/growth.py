@@ -8,11 +8,14 @@ Kalal, Mikolajczyk and Matas (ICPR 2010).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import Floats
+from vehicle_detection.camera import Camera
 
 Gray = NDArray[np.uint8]
 
@@ -26,6 +29,8 @@ _FACE_ASPECT = 1.25
 _MIN_WIDTH, _MIN_AGREEING = 10.0, 0.25
 # Standard error from which on the points do not fit a growth: a vehicle that turns, or another one.
 _MAX_STD = 0.02
+# Relative error of the growth by a turn of the camera, as a vehicle may move sideways, too.
+_TURN_STD = 0.3
 # Residuals of points, in standard errors, from which on their weight falls (Cauchy's).
 _OUTLIER, _ITERATIONS = 2.0, 5
 # Least standard error of a growth, and factor of the standard error of its fit, as neighboring points share
@@ -43,29 +48,33 @@ def small_gray(frame: NDArray[np.uint8]) -> Gray:
     return np.asarray(cv2.cvtColor(resized, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def measure_growth(before: Gray, after: Gray, boxes: Floats, new_boxes: Floats) -> tuple[Floats, Floats]:
+def measure_growth(
+    before: Gray, after: Gray, boxes: Floats, new_boxes: Floats, camera: Camera
+) -> tuple[Floats, Floats]:
     """Logarithm of the growth of each vehicle, and its standard error, infinite where it cannot be measured.
 
-    `boxes` and `new_boxes` are ``(N, 4)`` in pixels of the gray images `before` and `after`.
+    `boxes` and `new_boxes` are ``(N, 4)`` in pixels of the gray images `before` and `after`, and `camera` is
+    that of these. What the camera's own turning adds to the growth is subtracted.
     """
     if not len(boxes):
         return np.empty(0), np.empty(0)
-    points = _grid(boxes, before.shape[1])
+    grid = _grid(boxes, before.shape[1])
     # Where the points are expected: at the same place in the box.
-    places = (points - boxes[:, None, :2]) / (boxes[:, None, 2:] - boxes[:, None, :2])
+    places = (grid - boxes[:, None, :2]) / (boxes[:, None, 2:] - boxes[:, None, :2])
     start = new_boxes[:, None, :2] + places * (new_boxes[:, None, 2:] - new_boxes[:, None, :2])
-    flat, found = (each.reshape(-1, 1, 2).astype(np.float32) for each in (points, start))
+    flat, found = (each.reshape(-1, 1, 2).astype(np.float32) for each in (grid, start))
     found, status, _ = cv2.calcOpticalFlowPyrLK(
         before, after, flat, found, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **_WINDOW
     )
-    valid = status.reshape(points.shape[:2]) > 0
-    shift = found.reshape(points.shape).astype(np.float64) - points
-    points = _centers_of_gradient(before, points)
-    scale, std, agreeing = _fit(points, points + shift, valid)
+    valid = status.reshape(grid.shape[:2]) > 0
+    points = _centers_of_gradient(before, grid)
+    moved = points + found.reshape(grid.shape).astype(np.float64) - grid
+    fit = _fit(_rectify(points, camera, before), _rectify(moved, camera, before), valid)
+    growth, turn_std = _without_turn(fit, before.shape[1] / 2, camera.focal_px)
     narrow = np.minimum(boxes[:, 2] - boxes[:, 0], new_boxes[:, 2] - new_boxes[:, 0]) < _MIN_WIDTH
-    unknown = narrow | (agreeing < _MIN_AGREEING) | (scale <= 0) | (_STD_FACTOR * std > _MAX_STD)
-    std = np.where(unknown, np.inf, np.hypot(_STD_FACTOR * std, _MIN_STD))
-    return np.log(np.where(unknown, 1.0, scale)), std
+    std = np.hypot(_STD_FACTOR * fit.std, np.hypot(turn_std, _MIN_STD))
+    unknown = narrow | (fit.agreeing < _MIN_AGREEING) | (fit.scale <= 0) | (std > _MAX_STD)
+    return np.where(unknown, 0.0, growth), np.where(unknown, np.inf, std)
 
 
 def _grid(boxes: Floats, frame_width: int) -> Floats:
@@ -103,24 +112,54 @@ def _centers_of_gradient(gray: Gray, points: Floats) -> Floats:
     return centers
 
 
-def _fit(points: Floats, found: Floats, valid: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
-    """Scale of ``found = scale * points + shift`` for each vehicle, by iteratively reweighted least squares.
+def _rectify(points: Floats, camera: Camera, image: Gray) -> Floats:
+    """Points as seen by a pinhole camera."""
+    if not camera.fisheye:
+        return points
+    flat = points.reshape(-1, 2)
+    return camera.rectify_boxes(np.concatenate([flat, flat], axis=1), image.shape)[:, :2].reshape(
+        points.shape
+    )
 
-    Returns also the standard error of the scale, and the fraction of points that agree with it.
-    """
+
+class _Fit(NamedTuple):
+    """``moved = scale * points + shift`` for each vehicle, ``(N,)`` each."""
+
+    scale: Floats
+    std: Floats  # standard error of the scale's logarithm
+    agreeing: Floats  # fraction of points that agree
+    middle: Floats  # column of the middle of the points, and how far it moves
+    shift: Floats
+
+
+def _fit(points: Floats, moved: Floats, valid: NDArray[np.bool_]) -> _Fit:
+    """Fit points ``(N, K, 2)`` by iteratively reweighted least squares."""
     weight = valid.astype(np.float64)
     for _ in range(_ITERATIONS):
         total = np.maximum(weight.sum(axis=1), 1e-9)[:, None]
-        x, y = (
-            each - ((weight[:, :, None] * each).sum(axis=1) / total)[:, None] for each in (points, found)
-        )
+        means = [(weight[:, :, None] * each).sum(axis=1) / total for each in (points, moved)]
+        x, y = points - means[0][:, None], moved - means[1][:, None]
         spread = np.maximum((weight[:, :, None] * x * x).sum(axis=(1, 2)), 1e-9)
         scale = (weight[:, :, None] * x * y).sum(axis=(1, 2)) / spread
         squares = np.square(y - scale[:, None, None] * x).sum(axis=2)
         # The median of the squared residuals of two coordinates is 1.386 variances.
-        ranked, middle = np.sort(np.where(valid, squares, np.inf), axis=1), valid.sum(axis=1) // 2
-        variance = np.maximum(np.take_along_axis(ranked, middle[:, None], axis=1) / 1.386, 1e-6)
+        ranked, half = np.sort(np.where(valid, squares, np.inf), axis=1), valid.sum(axis=1) // 2
+        half = np.minimum(half, valid.shape[1] - 1)
+        variance = np.maximum(np.take_along_axis(ranked, half[:, None], axis=1) / 1.386, 1e-6)
         weight = valid / (1 + squares / (_OUTLIER**2 * variance))
     count = weight.sum(axis=1)
-    variance_of_points = (weight * squares).sum(axis=1) / np.maximum(2 * count - 3, 1)
-    return scale, np.sqrt(variance_of_points / spread), count / weight.shape[1]
+    mean_square = (weight * np.where(valid, squares, 0.0)).sum(axis=1) / np.maximum(2 * count - 3, 1)
+    std = np.sqrt(mean_square / spread) / np.maximum(scale, 1e-9)
+    return _Fit(scale, std, count / weight.shape[1], means[0][:, 0], (means[1] - means[0])[:, 0])
+
+
+def _without_turn(fit: _Fit, middle: float, focal_px: float) -> tuple[Floats, Floats]:
+    """Logarithm of the growth without what a turn of the camera adds, and the standard error of that part.
+
+    A turn by ``w`` moves a point at ``t = x / focal`` by ``focal * (1 + t**2) * w``, and stretches what is
+    there by ``2 * t * w`` horizontally and ``t * w`` vertically. An approach moves it by ``x * growth``.
+    """
+    growth, t = np.log(np.maximum(fit.scale, 1e-9)), (fit.middle - middle) / focal_px
+    stretch = 1.5 * t / (1 + t * t)
+    straight = (growth - stretch * fit.shift / focal_px) / (1 - stretch * t)
+    return straight, _TURN_STD * np.abs(growth - straight)

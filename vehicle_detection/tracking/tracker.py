@@ -319,8 +319,9 @@ class Tracker:
             seen & ~measured.merged & (measured.covered == 0) & ~measured.truncated[:, [0, 2]].any(axis=1)
         )
         scale = gray.shape[1] / frame[1]
-        growth, std = measure_growth(self._gray, gray, scale * before[rows], scale * measured.boxes[rows])
-        result[rows, 0], result[rows, 1] = growth, std
+        boxes, new_boxes = scale * before[rows], scale * measured.boxes[rows]
+        camera = (self._lens or self.camera).for_shape(gray.shape)
+        result[rows] = np.stack(measure_growth(self._gray, gray, boxes, new_boxes, camera), axis=1)
         return result
 
     def _assign(
