@@ -25,7 +25,8 @@ def scene(center, width):
     small = cv2.resize(TEXTURE, None, fx=2 * scale, fy=2 * scale, interpolation=cv2.INTER_AREA)
     matrix[:, :2] /= small.shape[0] / 480
     cv2.warpAffine(small, matrix, (1280, 720), frame, borderMode=cv2.BORDER_TRANSPARENT)
-    box = np.array([center[0] - width / 2, center[1] - width / 2] * 2) + [0, 0, width, width]
+    left, top = center[0] - width / 2, center[1] - width / 2
+    box = np.array([left, top, left + width, top + width])
     return cv2.resize(frame, SHAPE[::-1], interpolation=cv2.INTER_AREA), box
 
 
