@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import Floats, check_boxes, check_number, check_shape
+from vehicle_detection._common import Floats, check
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera, FrameShape, lateral_offsets, truncated_edges
 from vehicle_detection.errors import InvalidInputError
@@ -182,8 +182,8 @@ def estimate_horizon(
     >>> round(found.horizon, 3), round(found.camera_height_m, 2)
     (0.55, 1.35)
     """
-    frame = check_shape(shape)
-    array = check_boxes(boxes).astype(np.float64)
+    frame = check.shape(shape)
+    array = check.boxes(boxes).astype(np.float64)
     whole = array[~truncated_edges(array, frame).any(axis=1)]
     if len(whole) < _MIN_BOXES:
         raise InvalidInputError(
@@ -192,7 +192,7 @@ def estimate_horizon(
         )
     height, height_std = _CAMERA_HEIGHT, _CAMERA_HEIGHT_STD
     if height_m is not None:
-        height = check_number(height_m, "height_m", above=0, high=100)
+        height = check.number(height_m, "height_m", above=0, high=100)
         height_std = _GIVEN_HEIGHT_STD * height
     mean = np.array([0.5 * frame[0], height])
     information = np.diag([1 / (_PRIOR_STD * frame[0]) ** 2, 1 / height_std**2])

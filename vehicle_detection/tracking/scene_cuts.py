@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_image
+from vehicle_detection._common import check
 
 Thumbnail = NDArray[np.float32]
 
@@ -55,7 +55,7 @@ class SceneCuts:
 
     def update(self, frame: NDArray[np.uint8]) -> bool:
         """Whether the next ``(H, W, 3)`` frame, of any size, belongs to another scene than the one before."""
-        check_image(frame, "frame")
+        check.image(frame, "frame")
         thumbnail = _make_thumbnail(frame)
         details = thumbnail - cv2.GaussianBlur(thumbnail, (0, 0), _BLUR)
         if self._last is not None and details.std() < _MIN_DETAIL:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, describe
+from vehicle_detection._common import check, describe
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tracking import FrameResult
 
@@ -63,7 +63,7 @@ def annotate_clip(
             f"clip must be a video clip of moviepy 2, got {describe(clip)}; pass VideoFileClip(path), or "
             "use process_video for a file"
         )
-    every = check_integer(every, "every", low=1, high=1000)
+    every = check.integer(every, "every", low=1, high=1000)
     if on_result is not None and not callable(on_result):
         raise InvalidInputError(f"on_result must be a function of a result, got {describe(on_result)}")
     fps = getattr(given, "fps", None)

@@ -26,8 +26,7 @@ from vehicle_detection._common import (
     Closing,
     available_cores,
     call_in_thread,
-    check_flags,
-    check_integer,
+    check,
     describe,
     pluralize,
     progress_bar,
@@ -503,11 +502,11 @@ def track(
     >>> track("test_images/*.jpg", "highway", end=0.08).to_pandas()[["frame", "track_id", "time_s"]].shape
     (5, 3)
     """
-    check_flags(frames=frames, progress=progress)
+    check.flags(frames=frames, progress=progress)
     start, end = check_span(start, end)
-    jobs = min(available_cores(), 4) if jobs is None else check_integer(jobs, "jobs", low=1)
+    jobs = min(available_cores(), 4) if jobs is None else check.integer(jobs, "jobs", low=1)
     if every is not None:
-        every = check_integer(every, "every", low=1, high=1000)
+        every = check.integer(every, "every", low=1, high=1000)
     with contextlib.ExitStack() as stack:
         found: Any = stack.enter_context(_open_detector(detector))
         opened = stack.enter_context(borrow_source(source))

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path, PurePath
 
-from vehicle_detection._common import check_path, is_hidden, is_url, natural_key
+from vehicle_detection._common import check, is_hidden, is_url, natural_key
 from vehicle_detection.errors import InvalidInputError
 
 VIDEO_SUFFIXES = {
@@ -32,7 +32,7 @@ def list_files(source: str | os.PathLike[str]) -> list[Path]:
     Empty if the source is anything else.
     """
     text = os.fsdecode(source)
-    path = check_path(text, "source", kind="the path of a video file")
+    path = check.path(text, "source", kind="the path of a video file")
     if is_url(text):
         return []
     if path.is_dir():
@@ -72,7 +72,7 @@ def walk_files(folder: Path, name: str = "source") -> Iterator[Path]:
 
 def check_file(path: str | os.PathLike[str]) -> Path:
     """Return the path of a readable regular file."""
-    path = check_path(path, "source", kind="the path of a video file")
+    path = check.path(path, "source", kind="the path of a video file")
     if path.is_dir():
         raise InvalidInputError(f"source {path} is a folder; choose a video file in it")
     if not path.exists():

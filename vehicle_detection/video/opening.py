@@ -13,16 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from vehicle_detection._common import (
-    NETWORK_TIMEOUT,
-    check_flags,
-    check_integer,
-    check_number,
-    check_path,
-    describe,
-    local_path,
-    temporary_folder,
-)
+from vehicle_detection._common import NETWORK_TIMEOUT, check, describe, local_path, temporary_folder
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.ffmpeg import (
     input_options,
@@ -116,11 +107,11 @@ def open_source(
         if fps is not None or stream is not None:
             raise InvalidInputError(f"source {source.name} is open already; omit fps and stream")
         return source
-    check_flags(reconnect=reconnect, strict=strict)
+    check.flags(reconnect=reconnect, strict=strict)
     if fps is not None:
-        fps = check_number(fps, "fps", above=0, high=1000)
+        fps = check.number(fps, "fps", above=0, high=1000)
     if stream is not None:
-        stream = check_integer(stream, "stream", low=0, high=1000)
+        stream = check.integer(stream, "stream", low=0, high=1000)
     opened = _open(source, _Options(fps, stream, live, reconnect, strict))
     opened.strict = strict
     return opened
@@ -202,7 +193,7 @@ def _open(source: object, options: _Options) -> FrameSource:
         return _open_stdin(options)
     if scheme := _URL.match(text):
         return _open_url(text, scheme[1].lower(), options)
-    path = check_path(text, "source", kind="the path of a video file")
+    path = check.path(text, "source", kind="the path of a video file")
     if (text.isdecimal() and not path.exists()) or text.startswith("/dev/video"):
         return _open_camera(text, options)
     if path.is_fifo():

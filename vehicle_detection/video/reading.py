@@ -19,7 +19,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import NETWORK_DEADLINE, Closing, check_number, pluralize
+from vehicle_detection._common import NETWORK_DEADLINE, Closing, check, pluralize
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.video.ffmpeg import (
     Process,
@@ -314,7 +314,7 @@ def stream_duration(path: Path | str, info: VideoInfo) -> float | None:
 def check_span(start: float | None, end: float | None) -> tuple[float | None, float | None]:
     """Return a time range in seconds if it is valid."""
     start, end = (
-        None if value is None else check_number(value, name, low=0, high=1e7)
+        None if value is None else check.number(value, name, low=0, high=1e7)
         for name, value in (("start", start), ("end", end))
     )
     if end is not None and (start or 0) >= end:

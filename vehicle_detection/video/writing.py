@@ -22,10 +22,8 @@ from vehicle_detection._common import (
     Closing,
     atomic_write,
     call_in_thread,
-    check_flags,
-    check_path,
+    check,
     check_suffix,
-    check_type,
     describe,
     invalid,
     temporary_folder,
@@ -219,8 +217,8 @@ def write_video(
     with contextlib.ExitStack() as stack:
         stack.enter_context(results)
         stack.enter_context(_name_changed_source(results.source))
-        check_flags(audio=audio, show=show)
-        check_type(encoding, "encoding", Encoding | None, "omit it for the default")
+        check.flags(audio=audio, show=show)
+        check.instance(encoding, "encoding", Encoding | None, "omit it for the default")
         if on_result is not None and not callable(on_result):
             raise InvalidInputError(f"on_result must be a function of a result, got {describe(on_result)}")
         started, sink, viewer = time.perf_counter(), None, None
@@ -459,7 +457,7 @@ def _open_writer(
 def check_video_target(target: object, sources: Sequence[Path] = ()) -> Path:
     """Return the path of a video that can be written and is none of the sources."""
     path = check_suffix(
-        check_path(target, "target", kind="the path of a video file"), "target", tuple(CONTAINERS)
+        check.path(target, "target", kind="the path of a video file"), "target", tuple(CONTAINERS)
     )
     if path.exists() and any(path.samefile(source) for source in sources):
         raise InvalidInputError(f"target {path} is the source; choose another name")
