@@ -135,9 +135,9 @@ class _Options:
 
     def probe(self, path: Path | str) -> VideoInfo:
         """Read the properties of a file or URL, and apply the options to it."""
-        return self.check(path, probe(path, self.stream))
+        return self.apply(path, probe(path, self.stream))
 
-    def check(self, path: Path | str, info: VideoInfo) -> VideoInfo:
+    def apply(self, path: Path | str, info: VideoInfo) -> VideoInfo:
         """Return the properties with the frame rate of the options, if the file has no times."""
         name = source_name(path)
         if self.fps is None:
@@ -274,7 +274,7 @@ def _open_url(url: str, scheme: str, options: _Options) -> FrameSource:
     if scheme in ("http", "https"):
         info = None if options.live else probe(url, options.stream)
         if info is not None and info.duration:
-            return VideoFile(url, options.check(url, info))
+            return VideoFile(url, options.apply(url, info))
     elif scheme not in _STREAM_SCHEMES:
         return _download(url, options)
     settings = (*(_RTSP_OPTIONS if scheme.startswith("rtsp") else ()), *network_options(url))
