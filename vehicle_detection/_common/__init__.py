@@ -60,9 +60,4 @@ from vehicle_detection._common.web import (
     web_proxy,
 )
 
-check_array, check_bool, check_boxes, check_choice = check.array, check.boolean, check.boxes, check.choice
-check_flags, check_image, check_integer, check_number = check.flags, check.image, check.integer, check.number
-check_patches, check_path, check_sequence = check.patches, check.path, check.sequence
-check_shape, check_type = check.shape, check.instance
-
 check_environment()

@@ -20,14 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    Floats,
-    check_bool,
-    check_integer,
-    check_number,
-    check_shape,
-    check_type,
-)
+from vehicle_detection._common import Floats, check
 from vehicle_detection.boxes import LOG_ODDS, Detections, Platt, box_areas, on_one_vehicle
 from vehicle_detection.camera import Camera, FrameShape, truncated_edges
 from vehicle_detection.tracking.association import (
@@ -112,11 +105,11 @@ class Tracker:
         camera: Camera | None = None,
         calibration: Platt | None = LOG_ODDS,
     ) -> None:
-        check_type(params, "params", TrackParams | None, "pass TrackParams()")
-        check_type(camera, "camera", Camera | None, "pass Camera.for_frame(image.shape)")
-        check_type(calibration, "calibration", Platt | None, "calibrate_scores makes one")
+        check.instance(params, "params", TrackParams | None, "pass TrackParams()")
+        check.instance(camera, "camera", Camera | None, "pass Camera.for_frame(image.shape)")
+        check.instance(calibration, "calibration", Platt | None, "calibrate_scores makes one")
         self._calibration = calibration
-        self._frame_seconds = 1 / check_number(fps, "fps", above=0, high=1e6)
+        self._frame_seconds = 1 / check.number(fps, "fps", above=0, high=1e6)
         self.params = params or TrackParams()
         self._smoother = KalmanSmoother(self.params)
         self._given_camera = camera or Camera.dashcam()
@@ -184,11 +177,11 @@ class Tracker:
         """
         if hasattr(detections, "xyxy"):
             detections = Detections.from_supervision(detections)
-        check_type(detections, "detections", Detections, "pass Detections(boxes, scores)")
-        frame = check_shape(shape)
-        if check_bool(cut, "cut"):
+        check.instance(detections, "detections", Detections, "pass Detections(boxes, scores)")
+        frame = check.shape(shape)
+        if check.boolean(cut, "cut"):
             self.end_tracks()
-        dt = self._advance(frame, time, check_integer(frames, "frames", low=1))
+        dt = self._advance(frame, time, check.integer(frames, "frames", low=1))
         if dt == 0:
             return self._tracks
         found = _sorted_inside(detections, frame)
@@ -236,9 +229,9 @@ class Tracker:
         (array([796., 400., 896., 490.]), array([800., 400., 900., 490.]))
         """
         last = 0.0 if self._time is None else self._time
-        dt = check_integer(frames, "frames", low=1) * self._frame_seconds
+        dt = check.integer(frames, "frames", low=1) * self._frame_seconds
         if time is not None:
-            dt = check_number(time, "time", low=last, high=1e12) - last
+            dt = check.number(time, "time", low=last, high=1e12) - last
         confirmed = [row for row, track in enumerate(self._live) if track.id]
         if self._shape is None or not confirmed:
             return ()
@@ -257,7 +250,7 @@ class Tracker:
         """Set the time of this frame and return the seconds since the last; end all tracks at a jump."""
         usual = frames * self._frame_seconds
         last = -usual if self._time is None else self._time
-        now = last + usual if time is None else check_number(time, "time", low=-1e12, high=1e12)
+        now = last + usual if time is None else check.number(time, "time", low=-1e12, high=1e12)
         dt = usual if self._time is None else now - last
         jump = dt < 0 or dt > max(self.params.max_gap, 1.5 * usual)
         if self._horizon_shape != frame:
