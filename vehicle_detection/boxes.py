@@ -163,7 +163,7 @@ class Detections:
         return found if class_ids is None else select_classes(found, check_class_ids(class_ids))
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Return a table with a row for each box: corners, score and, if known, confidence and class.
+        """Return a table with a row for each box: corners, score and, if known, confidence, class, distance.
 
         >>> Detections(np.array([[0.0, 0, 50, 40]]), np.array([1.5])).to_pandas().iloc[0].to_dict()
         {'x1': 0.0, 'y1': 0.0, 'x2': 50.0, 'y2': 40.0, 'score': 1.5}
@@ -171,7 +171,7 @@ class Detections:
         import pandas
 
         columns = {**dict(zip(("x1", "y1", "x2", "y2"), self.boxes.T)), "score": self.scores}
-        more = {"confidence": self.confidences, "label": self.labels, "class_id": self.class_ids}
+        more = {name: getattr(self, attribute, None) for name, attribute in TABLE_COLUMNS.items()}
         return pandas.DataFrame(columns | {name: each for name, each in more.items() if each is not None})
 
     def to_supervision(self, *, tracker_id: ArrayLike | None = None) -> Any:
@@ -234,6 +234,11 @@ class Detections:
     def __iter__(self) -> Iterator[tuple[NDArray[Any], float]]:
         """Yield ``(box, score)`` pairs."""
         return zip(self.boxes, self.scores.tolist())
+
+
+TABLE_COLUMNS = {"confidence": "confidences", "label": "labels", "class_id": "class_ids"}
+TABLE_COLUMNS |= {"distance_m": "distances_m", "distance_std_m": "distance_stds_m"}
+"""Columns by the names that they have in tables; distances are those of images."""
 
 
 def _columns(detections: Detections) -> list[str]:

@@ -6,7 +6,7 @@ import importlib
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,6 @@ from vehicle_detection.drawing import draw_detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import image_array, write_image
 from vehicle_detection.tracking import Tracker
-
-if TYPE_CHECKING:
-    import pandas
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,11 +63,6 @@ class ImageDetections(Detections):
         vehicles show with a large error. A vehicle of which only the side is visible needs the horizon.
         """
         return image_distances(self, self.image.shape, camera)
-
-    def to_pandas(self) -> pandas.DataFrame:
-        """Return a table with a row for each box, as `Detections.to_pandas`, with distances if known."""
-        known = {"distance_m": self.distances_m, "distance_std_m": self.distance_stds_m}
-        return super().to_pandas().assign(**{name: each for name, each in known.items() if each is not None})
 
     def plot(self, **options: Any) -> NDArray[np.uint8]:
         """Return the image with its vehicles; the options are those of `draw_detections`."""

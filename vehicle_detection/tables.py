@@ -21,7 +21,7 @@ from vehicle_detection._common import (
     pluralize,
     shorten,
 )
-from vehicle_detection.boxes import Detections
+from vehicle_detection.boxes import TABLE_COLUMNS, Detections
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.tracking import TRACK_VALUES, UNKNOWN_LABEL, is_result, shown_tracks
 
@@ -74,8 +74,6 @@ _COLUMNS = {
     "ignore": _Column(False),
 }
 """All columns except ``frame`` and the corners of the boxes."""
-_OF_DETECTIONS = {"confidence": "confidences", "label": "labels"}
-_OF_DETECTIONS |= {"distance_m": "distances_m", "distance_std_m": "distance_stds_m"}
 _CORNER = _Column(math.nan, -_ABSURD, _ABSURD, f"a number of pixels up to {_ABSURD:g}")
 
 _NUMBERS = (*TRACK_VALUES[:-1], "time_since_update")  # values of a `Track`
@@ -184,9 +182,9 @@ class TrackTable:
             check.instance(found, f"detections[{key!r}]", Detections, "pass Detections(boxes, scores)")
         parts = [Detections.empty(), *detections.values()]
         columns = {}
-        for name, attribute in _OF_DETECTIONS.items():
+        for name, attribute in TABLE_COLUMNS.items():
             values = [getattr(each, attribute, None) for each in parts]
-            if name == "confidence" or any(each is not None for each in values):
+            if name in _COLUMNS and (name == "confidence" or any(each is not None for each in values)):
                 gaps = [np.full(len(each), _COLUMNS[name].missing) for each in parts]
                 columns[name] = np.concatenate([g if v is None else v for g, v in zip(gaps, values)])
         return cls(

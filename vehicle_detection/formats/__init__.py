@@ -1,9 +1,4 @@
-"""Files of tracks, detections and labels: CSV, JSON Lines, Parquet, MOT, CVAT, COCO, KITTI and YOLO.
-
-Every table has the columns ``frame,track_id,x1,y1,x2,y2,score``. Tables of tracks go on with
-``distance_m,speed_mps,confidence,distance_std_m,speed_std_mps`` and, with a frame rate, ``time_s``; tables of
-detections in images with ``confidence``.
-"""
+"""Files of tracks, detections and labels: CSV, JSON Lines, Parquet, MOT, CVAT, COCO, KITTI and YOLO."""
 
 from vehicle_detection.formats.read import FORMATS, read_labels
 from vehicle_detection.formats.rows import without_suffix

@@ -231,7 +231,7 @@ def open_coco(part: Path, shape: tuple[int, ...] | None, truth: Truth | None) ->
         frames.add(frame)
         for record in records:
             count += 1
-            result = _result(record, numbers.number(record) + 1, truth)
+            result = _result(record, numbers(record)[0] + 1, truth)
             ignore = record.get("ignore", False)
             width, height = result["bbox"][2:]
             flags = {"area": round(width * height, 2), "iscrowd": int(ignore)}

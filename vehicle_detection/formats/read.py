@@ -363,11 +363,9 @@ def read_labels(
     Notes
     -----
     KITTI's ``DontCare`` and COCO's crowds become regions; trams, trailers and the like become ignored boxes,
-    as do KITTI's vehicles that are largely hidden, truncated by more than 0.7 or narrower than 40 px, the
-    same rule as in the project's labels. Persons are left out. Other classes become ignored boxes in KITTI,
-    and are left out elsewhere. A MOT file is ground truth if all rows end with a flag (0: ignored), a
-    class and a visible fraction; in others column seven is the score. Occlusion and tracks may stand among
-    COCO's ``attributes``, as CVAT writes them.
+    as do KITTI's other classes but persons, and its vehicles that are largely hidden, truncated by more than
+    0.7 or narrower than 40 px, as in the project's labels. A MOT file is ground truth if all rows end with a
+    flag (0: ignored), a class and a visible fraction; in others column seven is the score.
 
     Examples
     --------

@@ -45,18 +45,13 @@ class ClassNumbers:
         self._numbers = {name: number for number, name in enumerate((UNKNOWN_LABEL, *VEHICLE_CLASSES[:-1]))}
         self.used = set[str]()
 
-    def name(self, record: Record) -> str:
-        """Return the class of a row, with a warning if it is new and not read by default."""
+    def __call__(self, record: Record) -> tuple[int, str]:
+        """Return number and name of the class of a row, with a warning if it is not read by default."""
         name = class_name(record.get("label"))
         if name not in self._numbers and not record.get("ignore"):
             _LOGGER.warning("boxes of class %r are read back only if classes= names it", name)
         self.used.add(name)
-        self._numbers.setdefault(name, len(self._numbers))
-        return name
-
-    def number(self, record: Record) -> int:
-        """Return the number of the class of a row."""
-        return self._numbers[self.name(record)]
+        return self._numbers.setdefault(name, len(self._numbers)), name
 
     @property
     def names(self) -> list[str]:

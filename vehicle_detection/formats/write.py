@@ -177,7 +177,7 @@ def _open_mot_zip(part: Path, target: _Target) -> Iterator[Write]:
             io.TextIOWrapper(binary, "utf-8", newline="\n") as text,
         ):
             yield lambda _, records: text.writelines(
-                _mot_line(record, first_pixel=0, vehicle_class=numbers.number(record) + 1, scores=False)
+                _mot_line(record, first_pixel=0, vehicle_class=numbers(record)[0] + 1, scores=False)
                 for record in records
             )
         # Without the time of day, as the other member: the same tracks give the same archive.
@@ -222,7 +222,7 @@ def _open_yolo(part: Path, target: _Target) -> Iterator[Write]:
             known = record.get("confidence")
             values.append(1 / (1 + math.exp(min(-record["score"], 700))) if known is None else known)
             track = [] if record["track_id"] in (None, NO_TRACK) else [str(record["track_id"])]
-        return " ".join([str(numbers.number(record)), *(f"{value:.6f}" for value in values), *track]) + "\n"
+        return " ".join([str(numbers(record)[0]), *(f"{value:.6f}" for value in values), *track]) + "\n"
 
     (part / "labels").mkdir()
     yield _folder_writer(
@@ -239,7 +239,7 @@ def _open_kitti(part: Path, target: _Target) -> Iterator[Write]:
 
     def line(record: Record) -> str:
         # KITTI has no type for all vehicles, and no spaces in types.
-        label = classes.name(record)
+        _, label = classes(record)
         name = "Car" if label == UNKNOWN_LABEL else label.capitalize().replace(" ", "_")
         name = "DontCare" if record.get("ignore", False) else name
         words = [name, record.get("truncated", 0.0), record.get("occluded", 0), -10]
@@ -394,12 +394,10 @@ def write_tracks(
 
     Notes
     -----
-    ``frame`` counts from 0, the first processed frame; boxes are half-open pixels with two decimals.
-    Unknown values are empty in CSV and null elsewhere. The score is the log-odds above the threshold, the
-    confidence a calibrated probability; speeds are relative to the camera. The label is the class, also
-    of boxes in COCO, YOLO and CVAT, ``vehicle`` if the model does not tell kinds apart. Images have the
-    columns up to ``score``, ``confidence``, ``label`` and, if known, distances. The archive for CVAT has no
-    scores.
+    ``frame`` counts from 0, the first processed frame; boxes are half-open pixels with two decimals. Unknown
+    values are empty in CSV and null elsewhere. The score is the log-odds above the threshold, the confidence
+    a calibrated probability, the label the class, ``vehicle`` if the model does not tell kinds apart; speeds
+    are relative to the camera. The archive for CVAT has no scores.
 
     Examples
     --------
@@ -421,9 +419,8 @@ def write_tracks(
         return stream.rows
     named = any(isinstance(key, str) for key in results.frame_keys)
     kind = _check_format(path, format, _STILL_FORMATS if named else _TRACK_FORMATS)
-    columns = tuple(name for name in TRACK_COLUMNS if not named or name in _STILL_COLUMNS)
-    if named and "distance_m" not in results.columns:
-        columns = tuple(name for name in columns if not name.startswith("distance"))
+    unknown = {"distance_m", "distance_std_m"}.difference(results.columns)
+    columns = tuple(name for name in _STILL_COLUMNS if name not in unknown) if named else TRACK_COLUMNS
     records = [_round(record) for record in _table_records(results, columns)]
     for record in records if named else ():
         record["track_id"] = None if record["track_id"] == NO_TRACK else record["track_id"]
