@@ -273,8 +273,7 @@ class Detector(Closing):
         Returns
         -------
         ImageDetections
-            Boxes in pixels of the image, with scores and, unless they come from a heat map, confidences; with
-            distances if the lens of `camera` is known.
+            Boxes (px), scores, confidences unless from a heat map, and distances if `camera` has a lens.
         """
         limit = None if conf is None else _check_confidence(conf, self.region_params)
         if limit is not None and not isinstance(self.model, VehicleClassifier):
@@ -292,11 +291,9 @@ class Detector(Closing):
             lowest = self.model.calibration.score(limit)
             if isinstance(regions, RegionParams):
                 regions = regions.with_peak(lowest)
-        low_score = min(self.low_score, lowest)
-        frame = image_array(image)
-        vehicles = self._fit(
-            self._search.find(frame, self.search_params, min_vehicle_score=low_score), regions
-        )
+        frame, low_score = image_array(image), min(self.low_score, lowest)
+        result = self._search.find(frame, self.search_params, min_vehicle_score=low_score)
+        vehicles = self._fit(result, regions)
         vehicles = vehicles[vehicles.scores >= lowest]
         if not isinstance(self.model, VehicleClassifier):
             vehicles = vehicles.with_columns(scores=vehicles.scores - lowest)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Floats, in_notebook
+from vehicle_detection._common import Floats, check, in_notebook
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
 from vehicle_detection.drawing import draw_detections
@@ -85,6 +85,7 @@ class ImageDetections(Detections):
 
 def image_distances(found: Detections, shape: tuple[int, ...], camera: Camera) -> Floats:
     """Distances and standard errors of the vehicles of one image, as `ImageDetections.distances`."""
+    check.instance(camera, "camera", Camera, "pass Camera.dashcam(fov=90)")
     values = np.full((2, len(found)), np.nan)
     # At one frame per second, frames share no errors, as if there was one.
     if not camera.horizon_is_known and not camera.fisheye:
