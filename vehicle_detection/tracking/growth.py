@@ -31,6 +31,8 @@ _MIN_WIDTH, _MIN_AGREEING = 10.0, 0.25
 _MAX_STD = 0.02
 # Relative error of the growth by a turn of the camera, as a vehicle may move sideways, too.
 _TURN_STD = 0.3
+# Pixels around the vehicles that are used, too.
+_BORDER = 24
 # Residuals of points, in standard errors, from which on their weight falls (Cauchy's).
 _OUTLIER, _ITERATIONS = 2.0, 5
 # Least standard error of a growth, and factor of the standard error of its fit, as neighboring points share
@@ -62,13 +64,18 @@ def measure_growth(
     # Where the points are expected: at the same place in the box.
     places = (grid - boxes[:, None, :2]) / (boxes[:, None, 2:] - boxes[:, None, :2])
     start = new_boxes[:, None, :2] + places * (new_boxes[:, None, 2:] - new_boxes[:, None, :2])
-    flat, found = (each.reshape(-1, 1, 2).astype(np.float32) for each in (grid, start))
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        before, after, flat, found, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **_WINDOW
+    # Only the part of the images with the vehicles is used, as its pyramids take most of the time.
+    corners = np.concatenate([boxes.reshape(-1, 2), new_boxes.reshape(-1, 2)])
+    x1, y1 = np.maximum(corners.min(axis=0).astype(int) - _BORDER, 0)
+    x2, y2 = corners.max(axis=0).astype(int) + _BORDER
+    parts = [image[y1:y2, x1:x2] for image in (before, after)]
+    flat, found = ((each - (x1, y1)).reshape(-1, 1, 2).astype(np.float32) for each in (grid, start))
+    shift, status, _ = cv2.calcOpticalFlowPyrLK(
+        *parts, flat, found, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **_WINDOW
     )
     valid = status.reshape(grid.shape[:2]) > 0
     points = _centers_of_gradient(before, grid)
-    moved = points + found.reshape(grid.shape).astype(np.float64) - grid
+    moved = points + (shift - flat).reshape(grid.shape).astype(np.float64)
     fit = _fit(_rectify(points, camera, before), _rectify(moved, camera, before), valid)
     growth, turn_std = _without_turn(fit, before.shape[1] / 2, camera.focal_px)
     narrow = np.minimum(boxes[:, 2] - boxes[:, 0], new_boxes[:, 2] - new_boxes[:, 0]) < _MIN_WIDTH
