@@ -148,11 +148,13 @@ def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
 
 
 INTERNAL = {
-    "Event.text", "FeatureParams.spatial_planes", "FrameResult.unsearched", "FrameSource.audio",
+    "Detector.reduction", "Event.text", "FeatureParams.spatial_planes", "FrameResult.unsearched",
+    "FrameSource.audio",
     "FrameSource.read", "HeatParams.for_search", "NetworkModel.feeds", "NetworkModel.input_size_for",
     "NetworkModel.name_classes", "NetworkModel.network_probability", "NetworkModel.scores",
     "NetworkModel.with_confidence",
-    "RegionParams.with_peak", "SearchBand.place", "SearchParams.place", "TrackTable.select",
+    "RegionParams.with_peak", "SearchBand.place", "SceneCuts.sample_size", "SearchParams.place",
+    "SearchResult.enlarged", "TrackTable.select", "VehicleDetector.reduction",
 }  # fmt: skip
 """Methods that only the library calls, with its own results."""
 
