@@ -32,7 +32,18 @@ def test_help_has_a_short_option():
         assert "Show this message and exit" in succeed(*words, "-h")
 
 
-HEAVY = {"numba", "scipy", "sklearn", "skimage", "pandas", "matplotlib", "moviepy", "jinja2", "pooch"}
+HEAVY = {
+    "numba",
+    "scipy",
+    "sklearn",
+    "skimage",
+    "pandas",
+    "matplotlib",
+    "moviepy",
+    "jinja2",
+    "pooch",
+    "pydantic",
+}
 
 
 @pytest.mark.parametrize(
@@ -41,7 +52,7 @@ HEAVY = {"numba", "scipy", "sklearn", "skimage", "pandas", "matplotlib", "moviep
         (["--help"], HEAVY | {"rich", "numpy", "cv2", "onnxruntime"}),
         (["video", "--help"], HEAVY | {"rich", "numpy", "cv2", "onnxruntime"}),
         (["info"], HEAVY),
-        (["detect", "road.png", "--output", "found"], HEAVY | {"rich"}),
+        (["detect", "road.png", "--output", "found", "--conf", "0.6"], HEAVY | {"rich", "PIL"}),
         (["video", "clip.mp4", "--output", "found.mp4", "--tracks", "found.csv"], HEAVY | {"rich"}),
     ],
 )

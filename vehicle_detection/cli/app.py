@@ -129,7 +129,7 @@ def _process_value(param: Any, by_typer: Callable[..., Any], ctx: Any, value: An
     convert = _CONVERTERS.get(param.type_descriptor.annotation)
     if value is None and not param.required:
         converted: Any = () if param.multiple or param.nargs == -1 else None
-    elif convert is None or not value:
+    elif convert is None or (param.required and not value):
         return by_typer(ctx, value)
     else:
         try:
