@@ -129,7 +129,7 @@ def update_distances(
     _loosen(mean, cov, states, measured, dt)
     view = _view(mean, measured, camera, dt, correlation_time)
     if measured.growth is not None:
-        mean, cov = _correct_by_growth(mean, cov, *measured.growth.T, camera, dt)
+        mean, cov = _correct_by_growth(mean, cov, measured.growth, camera, dt)
     view = _start(mean, cov, view, camera)
     mean, cov = _correct_by_bottom(mean, cov, view, camera)
     np.clip(mean[:, DISTANCE], _MIN_DISTANCE, _MAX_DISTANCE, out=mean[:, DISTANCE])
@@ -214,12 +214,14 @@ def _start(mean: Floats, cov: Floats, view: _View, camera: Camera) -> _View:
 
 
 def _correct_by_growth(
-    mean: Floats, cov: Floats, growth: Floats, std: Floats, camera: Camera, dt: float
+    mean: Floats, cov: Floats, growth: Floats, camera: Camera, dt: float
 ) -> tuple[Floats, Floats]:
-    """Correct by the logarithm of the growth since the last frame: that of the distance before over now.
+    """Correct by ``(N, 2)`` logarithms of the growth since the last frame, and their standard errors.
 
-    The pixels that are followed lie between the nearest part and the tires.
+    The growth is the distance before over that of now. The pixels that are followed lie between the nearest
+    part and the tires.
     """
+    logarithm, std = growth.T
     far = mean[:, DISTANCE] + camera.overhang_m / 2
     before = np.maximum(far - dt * mean[:, SPEED], 0.1 * far)
     jacobian = np.zeros_like(mean)
@@ -227,7 +229,11 @@ def _correct_by_growth(
     shared = np.square(_GROWTH_BIAS * dt) * max(1.0, _SHARED_TIME / dt)
     known = np.isfinite(std) & (cov[:, DISTANCE, DISTANCE] < _INITIAL_DISTANCE_STD**2 / 2)
     return _scalar_update(
-        mean, cov, jacobian, growth - np.log(before / far), np.where(known, np.square(std) + shared, np.inf)
+        mean,
+        cov,
+        jacobian,
+        logarithm - np.log(before / far),
+        np.where(known, np.square(std) + shared, np.inf),
     )
 
 

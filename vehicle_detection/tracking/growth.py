@@ -8,7 +8,7 @@ Kalal, Mikolajczyk and Matas (ICPR 2010).
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -38,7 +38,15 @@ _OUTLIER, _ITERATIONS = 2.0, 5
 # Least standard error of a growth, and factor of the standard error of its fit, as neighboring points share
 # their errors; both measured on rendered drives.
 _MIN_STD, _STD_FACTOR = 0.001, 1.5
-_WINDOW = {"winSize": (9, 9), "maxLevel": 2, "criteria": (3, 10, 0.02), "minEigThreshold": 1e-4}
+# Options of the search for a point: window, pyramid levels, end of its iterations, least texture.
+_REACH = 4
+_SEARCH: dict[str, Any] = {
+    "winSize": (2 * _REACH + 1, 2 * _REACH + 1),
+    "maxLevel": 2,
+    "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.02),
+    "minEigThreshold": 1e-4,
+    "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+}
 
 
 def small_gray(frame: NDArray[np.uint8]) -> Gray:
@@ -68,11 +76,9 @@ def measure_growth(
     corners = np.concatenate([boxes.reshape(-1, 2), new_boxes.reshape(-1, 2)])
     x1, y1 = np.maximum(corners.min(axis=0).astype(int) - _BORDER, 0)
     x2, y2 = corners.max(axis=0).astype(int) + _BORDER
-    parts = [image[y1:y2, x1:x2] for image in (before, after)]
+    part = np.s_[y1:y2, x1:x2]
     flat, found = ((each - (x1, y1)).reshape(-1, 1, 2).astype(np.float32) for each in (grid, start))
-    shift, status, _ = cv2.calcOpticalFlowPyrLK(
-        *parts, flat, found, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **_WINDOW
-    )
+    shift, status, _ = cv2.calcOpticalFlowPyrLK(before[part], after[part], flat, found, **_SEARCH)
     valid = status.reshape(grid.shape[:2]) > 0
     points = _centers_of_gradient(before, grid)
     moved = points + (shift - flat).reshape(grid.shape).astype(np.float64)
@@ -102,8 +108,7 @@ def _centers_of_gradient(gray: Gray, points: Floats) -> Floats:
 
     A point beside the outline of a vehicle moves with the outline.
     """
-    reach = _WINDOW["winSize"][0] // 2
-    steps = np.arange(-reach - 1, reach + 2)
+    steps = np.arange(-_REACH - 1, _REACH + 2)
     height, width = gray.shape
     x = (points[:, :, 0].round().astype(int)[:, :, None] + steps).clip(0, width - 1)
     y = (points[:, :, 1].round().astype(int)[:, :, None] + steps).clip(0, height - 1)
