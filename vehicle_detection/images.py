@@ -37,6 +37,7 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".h
 
 # What a format's files begin with, and the class of Pillow that reads their header.
 _HEADERS = {
+    rb"\xff\xd8\xff": "JpegImagePlugin.JpegImageFile",
     rb"BM": "BmpImagePlugin.BmpImageFile",
     rb"RIFF.{4}WEBP": "WebPImagePlugin.WebPImageFile",
     rb"P[1-6][\s#]": "PpmImagePlugin.PpmImageFile",
@@ -55,8 +56,8 @@ def image_size(data: bytes) -> tuple[int, int] | None:
             return struct.unpack_from(">II", data, 16)
         if re.match(rb"GIF8[79]a", data):
             return struct.unpack_from("<HH", data, 6)
-        if data[:3] == b"\xff\xd8\xff":
-            return _jpeg_size(data)
+        if size := _jpeg_size(data):
+            return size
         file = io.BytesIO(data)
         if re.match(rb"II[*+]\0|MM\0[*+]", data):  # the tags only: Pillow knows fewer kinds of pixels
             tiff = importlib.import_module("PIL.TiffImagePlugin")
@@ -75,17 +76,16 @@ def image_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the first frame header (SOF) of a JPEG file, without importing Pillow."""
+    """Width and height in the frame header of a usual JPEG file, without the import of Pillow."""
     at = 2
-    while data[at] == 0xFF:
+    while data[:2] == b"\xff\xd8" and data[at] == 0xFF:
         marker = data[at + 1]
-        if marker == 0xFF:  # padding
-            at += 1
-        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+        if marker in (0xC0, 0xC1, 0xC2):
             height, width = struct.unpack_from(">HH", data, at + 5)
             return width, height
-        else:
-            at += 2 + int(struct.unpack_from(">H", data, at + 2)[0])
+        if marker < 0xC0 or 0xC5 <= marker <= 0xDA:  # not a segment that precedes the frame
+            break
+        at += 2 + int(struct.unpack_from(">H", data, at + 2)[0])
     return None
 
 
