@@ -602,6 +602,8 @@ def test_boxes_in_every_form():
     assert not lesson.add_heat(np.zeros((4, 4)), Detections.empty()).any()
 
 
+NAMES = {name: getattr(lesson, name) for name in lesson.__all__}
+
 SIGNATURES = {
     "get_hog_features": "img, orient=9, pix_per_cell=8, cell_per_block=2, vis=False, feature_vec=True",
     "bin_spatial": "img, size=(32, 32)",
@@ -647,7 +649,7 @@ def test_a_star_import_brings_the_lesson_functions():
     for name, module in modules.items():
         found = names[name]
         assert getattr(found, "__module__", found.__name__) == module
-    with pytest.raises(AttributeError, match="has no attribute 'plt'"):
+    with pytest.raises(AttributeError, match="plt"):
         getattr(lesson, "plt")  # noqa: B009
 
 
@@ -727,7 +729,7 @@ def call_data(models, files):
 
 @pytest.mark.parametrize(("form", "shape"), CALL_FORMS, ids=[form[:60] for form, _ in CALL_FORMS])
 def test_every_call_form_binds(call_data, form, shape):
-    assert np.shape(eval(form, {**vars(lesson), "np": np, "d": call_data})) == shape
+    assert np.shape(eval(form, {**NAMES, "np": np, "d": call_data})) == shape
 
 
 @pytest.mark.parametrize(
@@ -792,7 +794,7 @@ def test_every_call_form_binds(call_data, form, shape):
 def test_bad_input_raises_an_error_of_the_library(call_data, models, form, message):
     data = SimpleNamespace(**vars(call_data), options=models["all", "uint8"].options)
     with pytest.raises(InvalidInputError, match=message):
-        eval(form, {**vars(lesson), "np": np, "StandardScaler": StandardScaler, "d": data})
+        eval(form, {**NAMES, "np": np, "StandardScaler": StandardScaler, "d": data})
 
 
 def test_an_unknown_option_names_the_function_that_was_called(models):

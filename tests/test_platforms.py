@@ -29,11 +29,9 @@ POSIX_ONLY = {
 POSIX_MODULES = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
 
 GUARDED = {
-    ("_common.files", "_lock_folder", "fcntl"): "called unless sys.platform is win32",
     ("_common.files", "open_locked", "fcntl"): "called unless sys.platform is win32",
     ("_common.files", "open_locked", "os.O_CLOEXEC"): "called unless sys.platform is win32",
     ("_common.files", "open_locked", "os.O_NOFOLLOW"): "called unless sys.platform is win32",
-    ("_common.files", "_lock_folder", "os.O_CLOEXEC"): "called unless sys.platform is win32",
     ("_common.threads", "available_cores", "os.sched_getaffinity"): "hasattr; macOS does not have it, either",
     ("_common.threads", "", "os.register_at_fork"): "hasattr",
     ("network.model", "", "os.register_at_fork"): "hasattr",

@@ -419,9 +419,8 @@ class VehicleDetector(Closing):
         elif given := [name for name, value in options.items() if value is not None]:
             raise InvalidInputError(f"{given[0]} must be omitted with a Detector; pass it to the Detector")
         self.detector, self.camera = model, model.camera
-        self.annotator = (annotator or Annotator()).with_defaults(
-            camera=self.camera, heat=self.detector.heat_params
-        )
+        annotator = annotator or Annotator()
+        self.annotator = annotator.with_defaults(camera=self.camera, heat=self.detector.heat_params)
         self._one_thread = _OneThread()
         self._warned = False
         self.reset()
@@ -471,7 +470,8 @@ class VehicleDetector(Closing):
 
     def reduction(self, shape: tuple[int, ...]) -> int:
         """Whole factor by which the search reduces frames of this shape first, as `Detector.reduction`."""
-        return self.detector.reduction(shape)
+        own = type(self).search is VehicleDetector.search  # another one gets whole frames
+        return self.detector.reduction(shape) if own else 1
 
     @overload
     def detect(self, image: Image | bytes, *, conf: float | None = None) -> ImageDetections: ...

@@ -59,8 +59,8 @@ class ImageDetections(Detections):
     def distances(self, camera: Camera) -> Floats:
         """Distances along the road and their standard errors in meters, ``(2, N)``; NaN where unknown.
 
-        If that of the `camera` is unknown, the horizon is estimated from the vehicles of the image, which few
-        vehicles show with a large error. A vehicle of which only the side is visible needs the horizon.
+        Where the `camera` does not know its horizon, it is estimated from the vehicles of the image: with few
+        of them, the error is large. A vehicle of which only the side is visible needs the horizon.
         """
         return image_distances(self, self.image.shape, camera)
 
@@ -87,7 +87,8 @@ def image_distances(found: Detections, shape: tuple[int, ...], camera: Camera) -
     """Distances and standard errors of the vehicles of one image, as `ImageDetections.distances`."""
     check.instance(camera, "camera", Camera, "pass Camera.dashcam(fov=90)")
     values = np.full((2, len(found)), np.nan)
-    # At one frame per second, frames share no errors, as if there was one.
+    # With a frame a second, no error is taken to be shared with frames before. The horizon of a fisheye lens
+    # cannot be estimated.
     if not camera.horizon_is_known and not camera.fisheye:
         tracker = Tracker(camera=camera, fps=1)
         tracker.update(found, shape)

@@ -339,7 +339,7 @@ def test_a_file_on_other_storage_is_copied(clip, tmp_path, monkeypatch):
     """Copies of killed processes are removed."""
     fsspec = pytest.importorskip("fsspec")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    left = tmp_path / ".vehicle-source.abc.part"
+    left = tmp_path / ".vehicle-source.0.part.abc"
     left.mkdir()
     (left / "clip.mp4").write_bytes(b"x")
     with fsspec.open("memory://bucket/clip.mp4", "wb") as file:

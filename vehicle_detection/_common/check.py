@@ -1,4 +1,4 @@
-"""Checks of arguments: each error names the argument, the expectation, the value and the remedy.
+"""Checks of arguments: each error names the argument, the expectation and the value.
 
 >>> integer(0, "jobs", low=1)
 Traceback (most recent call last):

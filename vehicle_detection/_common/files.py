@@ -1,4 +1,4 @@
-"""Atomic output files: complete, or not written at all."""
+"""Files and folders to write: complete, or not at all."""
 
 from __future__ import annotations
 
@@ -79,10 +79,10 @@ def is_hidden(name: str) -> bool:
 def atomic_write(target: str | os.PathLike[str], name: str = "target") -> Iterator[Path]:
     """Yield a temporary path beside `target`, renamed to `target` if the block succeeds.
 
-    After an error or an interrupt, the temporary file is removed and an existing `target` is unchanged. That
-    of a killed process is used, and thereby removed, by the next one with the same target. The temporary name
-    has the suffix of `target`, which determines the format that many libraries write. A full disk and other
-    errors of the system are an `OutputError`.
+    After an error or an interrupt, the temporary file is removed and an existing `target` is unchanged. A
+    killed process leaves its temporary file, which the next one with the same target overwrites and renames.
+    The temporary name has the suffix of `target`, which determines the format that many libraries write. A
+    full disk and other errors of the system are an `OutputError`.
     """
     path = check_target(target, name)
     if path.is_symlink() and path.exists():  # the link stays one
@@ -188,7 +188,7 @@ def open_locked(part: Path) -> int | None:
             raise
         except OSError:  # a file system without locks
             os.close(handle)
-            part.unlink()
+            part.unlink(missing_ok=True)
             return None
         os.close(handle)
 

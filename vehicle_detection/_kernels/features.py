@@ -75,8 +75,7 @@ def hog_cells(image: NDArray[Any], orient: int, cell: int, transform_sqrt: bool)
     return cells
 
 
-# Values of a row that are processed together: their gradients and sums (10 rows of floats) fit into the
-# first-level cache.
+# Values of a row that are processed together: the rows of their gradients and sums stay in the cache.
 _TILE = 768
 
 

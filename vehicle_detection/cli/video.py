@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import itertools
 import re
 from collections import Counter
@@ -169,7 +170,9 @@ class VideoOptions:
     def with_target(self) -> VideoOptions:
         """Name the video to write if one is needed and none or a folder is named; it replaces no file."""
         source, folder = Path(self.source), self.output
-        if self.source.isdecimal() or "*" in self.source or self.source == "-" or common.is_url(self.source):
+        if self.source.isdecimal() or self.source == "-" or common.is_url(self.source):
+            return self
+        if glob.has_magic(self.source) and not source.exists():
             return self
         if folder is None:
             alone = not self.show and all(path is None for path in self.files().values())
@@ -179,11 +182,11 @@ class VideoOptions:
         elif not folder.is_dir():
             return self
         numbers = itertools.chain([""], (f"_{number}" for number in itertools.count(2)))
-        targets = (folder / f"{source.stem}_tracked{number}.mp4" for number in numbers)
+        targets = (folder / f"{source.absolute().stem}_tracked{number}.mp4" for number in numbers)
         return replace(self, output=next(target for target in targets if not target.exists()))
 
     def span(self) -> dict[str, Any]:
-        """First and last second of the source."""
+        """First and last second of the part to process."""
         return {"start": parse_time(self.start, "--start"), "end": parse_time(self.end, "--end")}
 
     def encoding(self) -> Any:
@@ -400,7 +403,7 @@ class SideOutputs:
             with option_names(path="--report"):
                 self._page = vd.ReportWriter(options.report, detector=detector, **page)
         self._table = self._page.table if self._page else vd.TrackTable()
-        # A camera that never ends would fill the memory with tracks that nobody asked for.
+        # With --quiet, a camera that never ends needs no memory for tracks that nobody asked for.
         wanted = options.report, options.events, options.clips, options.srt
         if not options.quiet or any(path is not None for path in wanted):
             writers.append(self._table.append)

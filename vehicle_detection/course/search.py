@@ -266,7 +266,7 @@ def find_car_windows(*args: Any, **options: Any) -> list[Corners]:
 
 @dataclass(frozen=True, kw_only=True)
 class _SearchOptions(FeatureOptions):
-    """The options of `find_car_windows`, checked."""
+    """The options of `find_cars`, checked."""
 
     ystart: int | None = integer(None, low=0)
     ystop: int | None = integer(None, low=0)

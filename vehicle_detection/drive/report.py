@@ -151,7 +151,10 @@ class ReportWriter:
                 raise InvalidInputError(f"path {self._path} is also the {name}; choose another name")
         self._video = None if video is None else Path(video)
         self._source = None if source is None else Path(hide_credentials(os.fspath(source))).name
-        self._source_path = None if source is None else str(Path(source))
+        self._source_path = None
+        if source is not None:
+            is_path = not is_url(os.fspath(source))
+            self._source_path = str(Path(source)) if is_path else hide_credentials(os.fspath(source))
         self._detector, self._units = detector, units
         self._embed_limit = check.integer(embed_limit, "embed_limit", low=0)
         self.table = TrackTable()  # of the frames that were added
@@ -427,7 +430,8 @@ def _figures(
 
 def _count_figure(table: TrackTable, axis: TimeAxis) -> Figure:
     counts = table.counts()
-    seconds = next((each for each in _COUNT_SECONDS if axis.seconds / each <= 300), 600)
+    fitting = (each for each in _COUNT_SECONDS if axis.seconds / each <= 300 and each * axis.fps >= 1)
+    seconds = next(fitting, 600)
     edges = [0.0]
     while edges[-1] < axis.frames:  # a frame belongs to the second in which it begins
         edges.append(min(math.ceil(len(edges) * seconds * axis.fps - 1e-6), axis.frames))

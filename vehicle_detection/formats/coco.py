@@ -81,7 +81,7 @@ def _read_file(source: Path, truth: Path | None = None) -> CocoFile:
         raise DatasetError(f"{source} is not a COCO file: it lacks the lists {', '.join(missing)}")
     try:
         images = {image["id"]: _frame_of(image) for image in data["images"]}
-        names = {entry["id"]: str(entry["name"]).lower() for entry in data["categories"]}
+        names = {entry["id"]: " ".join(str(entry["name"]).lower().split()) for entry in data["categories"]}
     except (KeyError, TypeError, AttributeError):
         raise DatasetError(
             f"{source}: every image and category needs an id, and every category a name"
@@ -94,7 +94,7 @@ def _read_file(source: Path, truth: Path | None = None) -> CocoFile:
 
 
 def _frame_of(image: dict[str, Any]) -> FrameKey:
-    """Frame of an image: its file name; the frame's number where `image_entry` put it into the name."""
+    """Frame of an image: its file name; the frame's number where `_image_entry` put it into the name."""
     name, frame = image.get("file_name", image["id"]), image.get("frame")
     return frame if isinstance(frame, int) and name == f"{frame:06d}" else name
 
@@ -114,6 +114,8 @@ def read_coco(
     file = _read_file(source, truth)
     vehicles = _vehicle_categories(file, source, classes)
     rows: list[tuple[str, Record]] = []
+    tracks = (_with_attributes(each).get("track_id") for each in file.annotations if isinstance(each, dict))
+    free = max((track for track in tracks if isinstance(track, int)), default=NO_TRACK) + 1
     for number, entry in enumerate(file.annotations):
         where = f"{source} annotation {number}"
         try:
@@ -130,12 +132,12 @@ def read_coco(
         entry = _with_attributes(entry)
         ignore = bool(entry.get("iscrowd") or entry.get("ignore") or category not in vehicles)
         # An ignored box without a track would be a region.
-        track = entry.get("track_id", number if ignore and entry.get("score") is None else NO_TRACK)
+        track = entry.get("track_id", free + number if ignore and entry.get("score") is None else NO_TRACK)
         # A crowd is a region, except for the ignored vehicles that are written here, which are marked twice.
         if entry.get("iscrowd") and not (entry.get("ignore") and "track_id" in entry):
             track = NO_TRACK
-        record = {name: entry.get(name) for name in (*TRACK_COLUMNS[6:-1], "occluded", "truncated")}
-        record |= {"frame": frame, "track_id": track, "ignore": ignore, "label": file.categories[category]}
+        record = {key: entry.get(key) for key in (*TRACK_COLUMNS[6:-1], "occluded", "truncated")}
+        record |= {"frame": frame, "track_id": track, "ignore": ignore, "label": name}
         rows.append((where, record | dict(zip(CORNERS, (x, y, x + width, y + height)))))
     return rows, list(file.images.values())
 
@@ -193,8 +195,8 @@ def read_truth(labels: TrackTable, truth: Path, *, results: bool) -> Truth:
         return Truth(images, {})
     vehicles, names = _vehicle_categories(file, truth, None), {*map(class_name, labels["label"])}
     categories = {name: number for number, name in file.categories.items()}
-    if len(vehicles) == 1:
-        categories |= dict.fromkeys(names, *vehicles)
+    if len(vehicles) == 1:  # of every class that the truth does not name
+        categories = dict.fromkeys(names, *vehicles) | categories
     missing = min(names - categories.keys(), default=None)
     if missing is not None:
         listed = ", ".join(map(repr, categories)) or "none"

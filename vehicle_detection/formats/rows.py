@@ -1,4 +1,4 @@
-"""What the readers of all formats share: the rows of a file, and its lines."""
+"""What readers and writers of formats share: the rows of a file, its lines, and numbers of classes."""
 
 from __future__ import annotations
 
@@ -44,11 +44,14 @@ class ClassNumbers:
     def __init__(self) -> None:
         self._numbers = {name: number for number, name in enumerate((UNKNOWN_LABEL, *VEHICLE_CLASSES[:-1]))}
         self.used = set[str]()
+        self._unusual = set[str]()  # of which a warning was logged
 
     def __call__(self, record: Record) -> tuple[int, str]:
         """Return number and name of the class of a row, with a warning if it is not read by default."""
         name = class_name(record.get("label"))
-        if name not in self._numbers and not record.get("ignore"):
+        usual = name in (UNKNOWN_LABEL, *VEHICLE_CLASSES)
+        if not usual and name not in self._unusual and not record.get("ignore"):
+            self._unusual.add(name)
             _LOGGER.warning("boxes of class %r are read back only if classes= names it", name)
         self.used.add(name)
         return self._numbers.setdefault(name, len(self._numbers)), name

@@ -83,9 +83,8 @@ def measure_growth(
     points = _centers_of_gradient(before, grid)
     moved = points + (shift - flat).reshape(grid.shape).astype(np.float64)
     fit = _fit(_rectify(points, camera, before), _rectify(moved, camera, before), valid)
-    growth, turn_std = _without_turn(fit, before.shape[1] / 2, camera.focal_px)
+    growth, std = _without_turn(fit, before.shape[1] / 2, camera.focal_px)
     narrow = np.minimum(boxes[:, 2] - boxes[:, 0], new_boxes[:, 2] - new_boxes[:, 0]) < _MIN_WIDTH
-    std = np.hypot(_STD_FACTOR * fit.std, np.hypot(turn_std, _MIN_STD))
     unknown = narrow | (fit.agreeing < _MIN_AGREEING) | (fit.scale <= 0) | (std > _MAX_STD)
     return np.where(unknown, 0.0, growth), np.where(unknown, np.inf, std)
 
@@ -156,7 +155,6 @@ def _fit(points: Floats, moved: Floats, valid: NDArray[np.bool_]) -> _Fit:
         squares = np.square(y - scale[:, None, None] * x).sum(axis=2)
         # The median of the squared residuals of two coordinates is 1.386 variances.
         ranked, half = np.sort(np.where(valid, squares, np.inf), axis=1), valid.sum(axis=1) // 2
-        half = np.minimum(half, valid.shape[1] - 1)
         variance = np.maximum(np.take_along_axis(ranked, half[:, None], axis=1) / 1.386, 1e-6)
         weight = valid / (1 + squares / (_OUTLIER**2 * variance))
     count = weight.sum(axis=1)
@@ -166,12 +164,15 @@ def _fit(points: Floats, moved: Floats, valid: NDArray[np.bool_]) -> _Fit:
 
 
 def _without_turn(fit: _Fit, middle: float, focal_px: float) -> tuple[Floats, Floats]:
-    """Logarithm of the growth without what a turn of the camera adds, and the standard error of that part.
+    """Logarithm of the growth without what a turn of the camera adds, and its standard error.
 
     A turn by ``w`` moves a point at ``t = x / focal`` by ``focal * (1 + t**2) * w``, and stretches what is
     there by ``2 * t * w`` horizontally and ``t * w`` vertically. An approach moves it by ``x * growth``.
     """
     growth, t = np.log(np.maximum(fit.scale, 1e-9)), (fit.middle - middle) / focal_px
-    stretch = 1.5 * t / (1 + t * t)
-    straight = (growth - stretch * fit.shift / focal_px) / (1 - stretch * t)
-    return straight, _TURN_STD * np.abs(growth - straight)
+    stretch = 1.5 * t / (1 + t * t)  # the mean of both directions, for a shift of one
+    # Far from the middle, a turn and an approach look the same.
+    part = np.maximum(1 - stretch * t, 0.1)
+    straight = (growth - stretch * fit.shift / focal_px) / part
+    turn_std = _TURN_STD * np.abs(growth - straight)
+    return straight, np.hypot(_STD_FACTOR * fit.std / part, np.hypot(turn_std, _MIN_STD))

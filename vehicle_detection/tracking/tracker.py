@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Floats, check
+from vehicle_detection._common import Floats, check, invalid
 from vehicle_detection.boxes import LOG_ODDS, Detections, Platt, box_areas, on_one_vehicle
 from vehicle_detection.camera import Camera, FrameShape, truncated_edges
 from vehicle_detection.tracking.association import (
@@ -179,6 +179,8 @@ class Tracker:
             detections = Detections.from_supervision(detections)
         check.instance(detections, "detections", Detections, "pass Detections(boxes, scores)")
         frame = check.shape(shape)
+        if gray is not None and (np.ndim(gray) != 2 or np.asarray(gray).dtype != np.uint8):
+            raise invalid("gray", "be an (H, W) uint8 array", gray, "pass tracking.small_gray(frame)")
         if check.boolean(cut, "cut"):
             self.end_tracks()
         dt = self._advance(frame, time, check.integer(frames, "frames", low=1))

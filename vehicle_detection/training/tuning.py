@@ -86,6 +86,8 @@ class TrialOptions:
     jobs: int | None = None  #: threads of the feature extraction
 
     def __post_init__(self) -> None:
+        if self.frames is not None:  # a generator can be read only once
+            object.__setattr__(self, "frames", self.frame_sets)
         for each in self.frame_sets:
             if not isinstance(each, LabelledFrames):
                 raise InvalidInputError(f"frames must be LabelledFrames, one or more; got {describe(each)}")
@@ -95,8 +97,10 @@ class TrialOptions:
     @property
     def frame_sets(self) -> tuple[LabelledFrames, ...]:
         """The sets of `frames` as a tuple."""
-        if self.frames is None or isinstance(self.frames, LabelledFrames):
-            return () if self.frames is None else (self.frames,)
+        if self.frames is None:
+            return ()
+        if isinstance(self.frames, LabelledFrames):
+            return (self.frames,)
         return check.sequence(self.frames, "frames", "LabelledFrames")
 
 
@@ -164,9 +168,9 @@ def compare_configurations(
     candidates = read_configurations(configurations, values)
     parts: list[Any] = list(_make_splits(patch_set, splits, _check_seeds(seeds)))
     trials, stored, rows = Trials(patch_set, options), RowStore(store, COLUMNS), []
-    # Candidates with the same features follow each other: the cache computes them once.
-    names = {name: place for place, name in enumerate(dict.fromkeys(each.name for each in candidates))}
-    candidates.sort(key=lambda candidate: names[candidate.name])
+    # Those of one name follow each other; they have the same features, which the cache computes once.
+    names = [*dict.fromkeys(each.name for each in candidates)]
+    candidates.sort(key=lambda candidate: names.index(candidate.name))
     none: list[Any] = [(None, None, None)]  # an impossible candidate has one row
     plan = [(each, part) for each in candidates for part in (none if each.error else parts)]
     with progress_bar(progress, len(plan), unit="trial") as bar:
@@ -192,7 +196,7 @@ def halve_configurations(
     split: str = "sequences",
     random_state: int = 0,
 ) -> list[dict[str, Any]]:
-    """Select the `count` best configurations by successive halving, best first.
+    """Select the `count` best configurations by successive halving, best first; all if there are no more.
 
     All are ranked on few patches of a split, the best third continues with three times as many, and so on
     (scikit-learn's ``HalvingGridSearchCV``). Impossible ones are left out.
@@ -216,6 +220,7 @@ def halve_configurations(
         def score(self, X: NDArray[np.uint8], y: NDArray[np.int64]) -> float:
             return self.model_.score(X, y)
 
+    check.integer(count, "count", low=1)
     possible = [each for each in dict.fromkeys(read_configurations(configurations)) if not each.error]
     if len(possible) <= count:
         return [each.options for each in possible]

@@ -272,12 +272,14 @@ def find_damage(path: Path | str, info: VideoInfo, end: int, log: str, *, stop: 
 
 def _decode_errors(log: str) -> tuple[int, str]:
     """Count the decoder's errors, and return the last one; the demuxer's concern other streams, too."""
-    count, last = 0, ""
+    count, last, counted = 0, "", False
     for line in log.splitlines():
         repeated = _REPEATED.search(line)
         if repeated:
-            count += int(repeated[1]) if last else 0
-        elif line.startswith("[") and not line.startswith("[in#"):
+            count += int(repeated[1]) if counted else 0
+            continue
+        counted = line.startswith("[") and not line.startswith("[in#")
+        if counted:
             count, last = count + 1, line
     return count, last_line(last)
 
