@@ -194,6 +194,12 @@ def test_coco_file(tmp_path):
     entry = BOX | {"track_id": 9, "score": 0.5}
     found = read_labels(written(tmp_path, coco(annotations=[entry], images=[{"id": 5}]), "a.json"))
     assert [found[name].tolist() for name in ("frame", "track_id", "score")] == [[5], [9], [0.5]]
+    # The number of an ignored box without a track is that of no other vehicle.
+    entries = [BOX | {"ignore": 1}, BOX | {"track_id": 0}, BOX | {"track_id": 1}]
+    found = read_labels(written(tmp_path, coco(annotations=entries), "b.json"))
+    assert len(set(found["track_id"].tolist())) == 3
+    spaced = coco(annotations=[BOX], categories=[{"id": 1, "name": " Car "}])
+    assert read_labels(written(tmp_path, spaced, "c.json"))["label"].tolist() == ["car"]
 
 
 @pytest.mark.parametrize(

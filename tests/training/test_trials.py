@@ -46,7 +46,7 @@ def test_a_trial_equals_training_on_that_part(patch_set, mirror, split):
 
 def test_frames_are_scored_like_the_detector(patch_set, frames, labels):
     other = LabelledFrames("again", {1: frames.frames[1]}, labels, horizon=0.5)
-    options = TrialOptions(frames=[frames, other], search_params=SEARCH)
+    options = TrialOptions(frames=iter([frames, other]), search_params=SEARCH)
     (row,) = compare_configurations(patch_set, [SMALL], C=0.1, options=options).to_dict("records")
     train = patch_set[split_sequences(patch_set).train]
     classifier = train_classifier(train.patches, train.labels, params=PARAMS, options=TrainingOptions(C=0.1))
