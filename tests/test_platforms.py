@@ -20,7 +20,7 @@ POSIX_ONLY = {
     },
     "signal": {
         "SIGALRM", "SIGCHLD", "SIGCONT", "SIGHUP", "SIGKILL", "SIGPIPE", "SIGQUIT", "SIGSTOP",
-        "SIGUSR1", "SIGUSR2", "alarm", "getitimer", "pause", "pthread_sigmask", "setitimer",
+        "SIGUSR1", "SIGUSR2", "alarm", "getitimer", "pause", "pthread_kill", "pthread_sigmask", "setitimer",
         "sigwait",
     },
 }  # fmt: skip
@@ -33,9 +33,11 @@ GUARDED = {
     ("_common.files", "open_locked", "os.O_CLOEXEC"): "called unless sys.platform is win32",
     ("_common.files", "open_locked", "os.O_NOFOLLOW"): "called unless sys.platform is win32",
     ("_common.threads", "available_cores", "os.sched_getaffinity"): "hasattr; macOS does not have it, either",
+    ("_common.signals", "_repeat", "signal.pthread_kill"): "hasattr",
     ("_common.threads", "", "os.register_at_fork"): "hasattr",
     ("network.model", "", "os.register_at_fork"): "hasattr",
     ("drive.worker_pool", "_prepare", "os.setpgid"): "hasattr",
+    ("drive.worker_pool", "_watch", "signal.pthread_kill"): "hasattr",
     ("_common.files", "private_folder", "os.getuid"): "hasattr",
     ("video.ffmpeg", "", "os.register_at_fork"): "hasattr",
     ("video.ffmpeg", "_enlarge", "fcntl"): "on Linux only",

@@ -1,7 +1,9 @@
 """Interrupts that arrive where Python prints an exception and goes on."""
 
+import _thread
 import contextlib
 import signal
+import sys
 import time
 import weakref
 
@@ -66,6 +68,18 @@ def test_an_interrupt_that_would_be_lost_is_repeated(handlers, arrive):
         arrive()
         with pytest.raises(KeyboardInterrupt):
             wait()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="its repeated signal wakes no thread")
+def test_a_repeated_interrupt_wakes_a_thread_that_waits_for_a_lock():
+    lock = _thread.allocate_lock()
+    lock.acquire()
+    with raise_on_signals():
+        remove_object()
+        began = time.monotonic()
+        with pytest.raises(KeyboardInterrupt):
+            lock.acquire(timeout=20)
+        assert time.monotonic() - began < 10
 
 
 @pytest.mark.parametrize("handlers", [worker_signals, raise_on_signals])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import _thread
 import signal
+import threading
 import time
 from types import FrameType
 
@@ -17,7 +18,7 @@ def postpone(number: int, frame: FrameType | None) -> bool:
     """Repeat the signal soon if an exception would be lost in `frame`; False if it would not."""
     while frame is not None:
         if frame.f_code.co_name == _FINALIZER or frame.f_globals.get("__name__") in _CALLBACKS:
-            # `threading` would take locks, which the interrupted code may hold.
+            # A thread of `threading` would take locks, which the interrupted code may hold.
             _thread.start_new_thread(_repeat, (number,))
             return True
         frame = frame.f_back
@@ -26,4 +27,7 @@ def postpone(number: int, frame: FrameType | None) -> bool:
 
 def _repeat(number: int) -> None:
     time.sleep(_REPEAT)
-    _thread.interrupt_main(signal.Signals(number))
+    if hasattr(signal, "pthread_kill"):  # it also wakes a thread that waits for a lock
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+    else:
+        _thread.interrupt_main(signal.Signals(number))
