@@ -323,9 +323,14 @@ def record_path(key: str) -> str:
 
 def read_records(store: Store, keys: Iterable[str] | None = None) -> dict[str, dict[str, Any]]:
     """Read the records of trips, or of all, by their keys; missing or damaged ones are left out."""
-    found = store.read_many(record_path(key) for key in (record_keys(store) if keys is None else keys))
-    parsed = ((key, _parse(key, data)) for key, data in ((_key(path), data) for path, data in found))
-    return {key: record for key, record in parsed if record is not None}
+    return {record["key"]: record for record in iterate_records(store, keys)}
+
+
+def iterate_records(store: Store, keys: Iterable[str] | None = None) -> Iterator[dict[str, Any]]:
+    """Yield the records of `read_records` one after the other, so that none has to be kept."""
+    for path, data in store.read_many(map(record_path, record_keys(store) if keys is None else keys)):
+        if (record := _parse(_key(path), data)) is not None:
+            yield record
 
 
 def _is_output(key: str, path: str) -> bool:
@@ -386,6 +391,9 @@ def record_keys(store: Store) -> list[str]:
     return [_key(path) for path in store.list_files(_FOLDER) if path.endswith(".json")]
 
 
+_SUMS = ("frames", "tracks", "video_seconds", "seconds")
+
+
 def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
     """Summarize the records of a batch, also while it runs.
 
@@ -396,19 +404,21 @@ def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
     0 trips done, 0 failed, 0 errors
     0.0 hours of video, 0 frames, 0 vehicles, 0.0 frames/s per worker
     """
-    records = list(read_records(open_store(out)).values())
-    done = [record for record in records if record["status"] == DONE]
-    bad = [record for record in records if record["status"] != DONE]
-    counts = Counter(record["status"] for record in records)
-    names = ("frames", "tracks", "video_seconds", "seconds")
-    sums = {name: sum(record.get(name, 0) for record in done) for name in names}
+    counts, sums = Counter[str](), Counter[str]()
+    messages: dict[str, str] = {}
+    for record in iterate_records(open_store(out)):
+        counts[record["status"]] += 1
+        if record["status"] == DONE:
+            sums.update({name: record.get(name) or 0 for name in _SUMS})
+        else:
+            messages[record["sources"][0]["uri"]] = record.get("message") or ""
     return BatchStatus(
         **{name: counts[status] for name, status in COUNTS.items()},
         frames=sums["frames"],
         tracks=sums["tracks"],
         video_seconds=float(sums["video_seconds"]),
         work_seconds=float(sums["seconds"]),
-        messages=dict(sorted((record["sources"][0]["uri"], record.get("message", "")) for record in bad)),
+        messages=dict(sorted(messages.items())),
     )
 
 
