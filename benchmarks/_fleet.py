@@ -21,24 +21,17 @@ class Fleet:
     """Cameras, and what a worker, the scheduler and the storage do."""
 
     cameras: int = 1000
-    hours: float = 10.0
-    """Hours of video that a camera records on a day."""
+    hours: float = 10.0  # of video from a camera on a day
     trip_s: float = 1200.0
     fps: float = 25.0
-    frames_per_s: float = 50.0
-    """Speed of a worker with one core, for tracks and video."""
-    megabytes_per_s: float = 0.5
-    """Bit rate of the cameras, in MB for a second of video."""
+    frames_per_s: float = 50.0  # of a worker with one core, for tracks and video
+    megabytes_per_s: float = 0.5  # of the cameras, for a second of video
     storage_mb_per_s: float = 1000.0
-    dispatch_s: float = 0.001
-    """Time of the scheduler for a trip, and of a request for the storage's list or for a record."""
-    request_s: float = 0.02
-    listed: int = 1000
-    """Files of an answer to a request for the list."""
-    parallel: int = 50
-    """Requests of a start for records at the same time."""
-    hours_between_losses: float = 100.0
-    """Mean time until a worker is lost, such as on a preemptible machine."""
+    dispatch_s: float = 0.001  # of the scheduler, for a trip
+    request_s: float = 0.02  # for a part of the storage's list, or a record
+    listed: int = 1000  # files in an answer to a request for the list
+    parallel: int = 50  # requests for records at the same time
+    hours_between_losses: float = 100.0  # mean time until a worker is lost, as on a preemptible machine
     restart_s: float = 60.0
 
     @property

@@ -236,8 +236,13 @@ class Detections:
         return zip(self.boxes, self.scores.tolist())
 
 
-TABLE_COLUMNS = {"confidence": "confidences", "label": "labels", "class_id": "class_ids"}
-TABLE_COLUMNS |= {"distance_m": "distances_m", "distance_std_m": "distance_stds_m"}
+TABLE_COLUMNS = {
+    "confidence": "confidences",
+    "label": "labels",
+    "class_id": "class_ids",
+    "distance_m": "distances_m",
+    "distance_std_m": "distance_stds_m",
+}
 """Columns by the names that they have in tables; distances are those of images."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 from collections import Counter, defaultdict
@@ -44,6 +45,8 @@ LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autoricksha
 """Classes whose boxes are vehicles by default, and classes whose labels are ignored."""
 _CLASS_COLUMNS = ("class", "label", "category")
 _OWN_COLUMNS = ({"score", "confidence", "label"}, {"track_id", "label", *LABEL_COLUMNS})  # of written files
+
+_LOGGER = logging.getLogger(__name__)
 
 _FLAGS = {"false": False, "true": True, "0": False, "1": True, "0.0": False, "1.0": True}
 # Distances and speeds beyond the first are unknown, corners of boxes are errors.
@@ -528,6 +531,12 @@ def _vehicle_rows(
     # Classes that are numbers or flags have no names: all rows are vehicles.
     known = bool(found) and not any(re.fullmatch(r"[-\d.]+|true|false", name) for name in found)
     if not known or (classes is None and any(cells.keys() >= own for own in _OWN_COLUMNS)):
+        others = found - {*VEHICLE_CLASSES, *LOOKALIKE_CLASSES}
+        if known and others and "score" not in cells:
+            listed = shorten(", ".join(sorted(others)))
+            _LOGGER.warning(
+                "%s: boxes of class %s are read as vehicles; classes= selects some", source, listed
+            )
         return np.ones(count, np.bool_), np.zeros(count, np.bool_), names if known else None
     wanted = VEHICLE_CLASSES if classes is None else classes
     check_classes(source, found, wanted)

@@ -399,6 +399,16 @@ def test_a_yolo_folder_without_names(tmp_path):
         read_labels(tmp_path, **options, classes=["car"])
 
 
+@pytest.mark.parametrize(("kinds", "named"), [("car pedestrian", True), ("car tram", False)])
+def test_a_table_like_those_written_here_may_hold_other_classes(tmp_path, caplog, kinds, named):
+    """All its rows are vehicles, which a warning says of classes that are none by default."""
+    head = "frame,track_id,x1,y1,x2,y2,occluded,truncated,ignore,label\n"
+    rows = (f"0,{track},0,0,50,40,0,0,0,{kind}\n" for track, kind in enumerate(kinds.split()))
+    labels = read_labels(written(tmp_path, head + "".join(rows), "a.csv"))
+    assert labels["label"].tolist() == kinds.split()
+    assert ("pedestrian are read as vehicles" in caplog.text) == named
+
+
 def test_files_without_a_class_of_vehicles_are_refused(tmp_path):
     options = {"format": "yolo", "shape": (100, 200)}
     (tmp_path / "a.txt").write_text("0 0.5 0.5 0.2 0.4\n")

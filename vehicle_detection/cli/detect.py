@@ -48,7 +48,7 @@ class _Image(NamedTuple):
     name: str
 
     def __str__(self) -> str:
-        return str(common.hide_credentials(str(self.source)))
+        return common.hide_credentials(str(self.source))
 
 
 @dataclass(frozen=True, kw_only=True)

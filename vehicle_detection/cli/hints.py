@@ -36,7 +36,7 @@ def hint_command(word: str, commands: Iterable[str]) -> str:
 def hint_option(word: str, params: Sequence[Any]) -> str:
     """Return what to write instead of an option that a command does not have; empty if that is unknown."""
     name = word.lstrip("-").lower().replace("-", "_")
-    argument, *_ = [*(str(param.metavar) for param in params if not param.opts[0].startswith("-")), ""]
+    argument = next((str(param.metavar) for param in params if not param.opts[0].startswith("-")), "")
     if argument and name in ("source", *common.synonyms("source"), argument.lower()):
         return f"pass {argument} without an option"
     words: dict[str, tuple[Any, str]] = {}

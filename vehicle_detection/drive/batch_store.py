@@ -46,9 +46,10 @@ COUNTS = {"done": DONE, "failed": FAILED, "errors": ERROR}
 
 _FOLDER = "records"
 # Values of a record by their kind, where they are given.
+_NUMBERS = ("frames", "tracks", "video_seconds", "seconds")
 _VALUES: dict[str, Any] = {
     **dict.fromkeys(("message", "camera", "date", "start", "damage"), str),
-    **dict.fromkeys(("frames", "tracks", "video_seconds", "seconds"), (int, float)),
+    **dict.fromkeys(_NUMBERS, (int, float)),
 }
 _MAX_NUMBER = 1e15
 _MAX_RECORD_BYTES = 100_000_000
@@ -169,7 +170,8 @@ class Store:
         def find() -> list[str]:
             if self._folder:  # without a request for each file, as `find` makes
                 walk = os.walk(self._path(f"{folder}/"), onerror=_raise)
-                return [os.path.join(parent, name) for parent, _, names in walk for name in names]
+                paths = (os.path.join(parent, name) for parent, _, names in walk for name in names)
+                return sorted(path.replace(os.sep, "/") for path in paths)
             self._filesystem.invalidate_cache()
             return [str(name) for name in self._filesystem.find(self._path(f"{folder}/"))]
 
@@ -253,12 +255,11 @@ def _is_file(path: str | os.PathLike[str]) -> bool:
 
 def _read_file(path: str) -> bytes | None:
     """Content of a regular file; None for a pipe, which would block, and for a link."""
-    status = os.lstat(path)
-    if not stat.S_ISREG(status.st_mode):
+    if not stat.S_ISREG(os.lstat(path).st_mode):
         return None
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))  # in half the time of `open`
-    try:
-        return os.read(handle, min(status.st_size, _MAX_RECORD_BYTES))
+    try:  # the size of the opened file, as another process may replace it
+        return os.read(handle, min(os.fstat(handle).st_size, _MAX_RECORD_BYTES))
     finally:
         os.close(handle)
 
@@ -391,9 +392,6 @@ def record_keys(store: Store) -> list[str]:
     return [_key(path) for path in store.list_files(_FOLDER) if path.endswith(".json")]
 
 
-_SUMS = ("frames", "tracks", "video_seconds", "seconds")
-
-
 def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
     """Summarize the records of a batch, also while it runs.
 
@@ -409,7 +407,7 @@ def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
     for record in iterate_records(open_store(out)):
         counts[record["status"]] += 1
         if record["status"] == DONE:
-            sums.update({name: record.get(name) or 0 for name in _SUMS})
+            sums.update({name: record.get(name) or 0 for name in _NUMBERS})
         else:
             messages[record["sources"][0]["uri"]] = record.get("message") or ""
     return BatchStatus(

@@ -26,6 +26,9 @@ from vehicle_detection.tables import (
 Write = Callable[[FrameKey, Sequence[Record]], None]
 """Writes rows of a frame, of which there may be none."""
 
+_VALUES = tuple(
+    name for name in TRACK_COLUMNS if name not in (*CORNERS, "frame", "track_id", "score", "label")
+)
 # Keys of other tools' JSON, in the whole or its first entry.
 _OTHER_TOOLS = (
     ({"shapes", "imagePath"}, "Labelme or X-AnyLabeling"),
@@ -136,7 +139,7 @@ def read_coco(
         # A crowd is a region, except for the ignored vehicles that are written here, which are marked twice.
         if entry.get("iscrowd") and not (entry.get("ignore") and "track_id" in entry):
             track = NO_TRACK
-        record = {key: entry.get(key) for key in (*TRACK_COLUMNS[6:-1], "occluded", "truncated")}
+        record = {key: entry.get(key) for key in ("score", *_VALUES, "occluded", "truncated")}
         record |= {"frame": frame, "track_id": track, "ignore": ignore, "label": name}
         rows.append((where, record | dict(zip(CORNERS, (x, y, x + width, y + height)))))
     return rows, list(file.images.values())
@@ -214,7 +217,7 @@ def _result(record: Record, category: Any, truth: Truth | None) -> Record:
     x1, y1, x2, y2 = (record[name] for name in CORNERS)
     result: Record = {"image_id": image["id"], "category_id": category}
     result["bbox"] = [x1, y1, without_noise(x2 - x1), without_noise(y2 - y1)]
-    known = {name: record.get(name) for name in ("score", "track_id", *TRACK_COLUMNS[7:-1])}
+    known = {name: record.get(name) for name in ("score", "track_id", *_VALUES)}
     known |= {"track_id": None} if known["track_id"] == NO_TRACK else {}
     return result | {name: value for name, value in known.items() if value is not None}
 

@@ -153,9 +153,10 @@ class _ImageReader(Reader):
         self._files: Iterator[tuple[int, Path]] = iter(chosen)
 
     def read_next(self) -> tuple[int, float, DecodedFrame] | None:
-        index, path = next(self._files, (-1, self._first))
-        if index < 0:
+        found = next(self._files, None)
+        if found is None:
             return None
+        index, path = found
         frame = read_image(path)
         if frame.shape != self.info.shape:
             raise InvalidInputError(
