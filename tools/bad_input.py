@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import inspect
 import itertools
 import pkgutil
@@ -119,6 +120,7 @@ def public_callables() -> dict[str, Callable[..., Any]]:
     return {name: value for name, value in called.items() if _parameters(value)}
 
 
+@functools.cache
 def package_names() -> dict[str, Any]:
     """Return the public names of the package and of its subpackages without a page of their own."""
     places = {

@@ -220,7 +220,8 @@ class _DaskExecutor(Executor):
 
 
 # What follows runs in the worker process.
-_busy = threading.Event()
+_idle = threading.Event()
+_idle.set()
 
 
 def _prepare(parent: Connection) -> None:
@@ -240,13 +241,13 @@ def _watch(parent: Connection) -> None:
     """Wait for the end of the parent process; then interrupt the current call, and end the worker."""
     with contextlib.suppress(EOFError, OSError):
         parent.recv()
-    if not _busy.is_set():
+    if _idle.is_set():
         os._exit(1)
     if hasattr(signal, "pthread_kill"):
         signal.pthread_kill(int(threading.main_thread().ident or 0), signal.SIGINT)
     else:
         signal.raise_signal(signal.SIGINT)
-    threading.Event().wait(_GRACE)
+    _idle.wait(_GRACE)
     os._exit(1)
 
 
@@ -256,11 +257,11 @@ def _call(function: Callable[..., Any], args: Any, kwargs: Any) -> tuple[Any, st
     logger, collector = logging.getLogger("vehicle_detection"), logging.Handler(logging.WARNING)
     collector.emit = lambda record: warnings.append(record.getMessage())  # type: ignore[method-assign]
     logger.addHandler(collector)
-    _busy.set()
+    _idle.clear()
     try:
         return function(*args, **kwargs), None, warnings
     except Exception as error:
         return None, f"{type(error).__name__}: {error}", warnings
     finally:
-        _busy.clear()
+        _idle.set()
         logger.removeHandler(collector)
