@@ -1,10 +1,14 @@
 import gc
 import os
+import zipfile
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 import pytest
 from hypothesis import settings
+
+from vehicle_detection.images import decode_image
 
 matplotlib.use("Agg")
 settings.register_profile("steady", derandomize=True, deadline=None, max_examples=25)
@@ -26,3 +30,15 @@ def real_data() -> Path:
     path = Path(folder)
     assert path.is_dir(), f"VEHICLE_DETECTION_DATA names {path}, which is no folder"
     return path
+
+
+@pytest.fixture(scope="session")
+def some_real_patches(real_data):
+    """Every tenth of the real patches, and their labels."""
+    patches, labels = [], []
+    for label, name in enumerate(("non-vehicles.zip", "vehicles.zip")):
+        with zipfile.ZipFile(real_data / name) as archive:
+            names = [each for each in archive.namelist() if each.endswith(".png") and "__MACOSX" not in each]
+            patches += [decode_image(archive.read(each), each) for each in sorted(names)[::10]]
+        labels += [label] * (len(patches) - len(labels))
+    return np.stack(patches), np.array(labels)

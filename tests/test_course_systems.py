@@ -20,7 +20,7 @@ from sklearn.tree import DecisionTreeClassifier
 import vehicle_detection.course
 from tests import lesson_reference
 from tests.helpers import rendered_patches
-from vehicle_detection import load_training_patches, read_image, write_image
+from vehicle_detection import read_image, write_image
 from vehicle_detection.scenes import render_scene
 
 pytestmark = pytest.mark.filterwarnings("ignore:the image has values 0-1, which")
@@ -245,10 +245,10 @@ def test_a_published_system_runs_with_another_import(system, data):
 
 
 @pytest.mark.realdata
-def test_the_first_write_up_finds_its_windows(real_data):
+def test_the_first_write_up_finds_its_windows(real_data, some_real_patches):
     """Its windows, features and split, with PNG files as 0-255 and as 0-1: about 18 and about 130 hits."""
     lesson = vehicle_detection.course
-    patches = load_training_patches(real_data / "vehicles.zip", real_data / "non-vehicles.zip")
+    patches, labels = some_real_patches
     options = {
         "color_space": "LUV", "spatial_size": (16, 16), "hist_bins": 16, "orient": 8, "pix_per_cell": 8,
         "cell_per_block": 2, "hog_channel": 0, "transform_sqrt": True,
@@ -272,14 +272,13 @@ def test_the_first_write_up_finds_its_windows(real_data):
             svc.score(X_test, y_test),
         )
 
-    hot, samples, accuracy = hot_windows(patches.patches[::3], patches.labels[::3])
-    assert (len(windows), samples) == (130, 1184)
+    hot, samples, accuracy = hot_windows(patches, labels)
+    assert (len(windows), samples) == (130, 356)
     assert 5 < len(hot) < 30  # 18 with all patches in the order of the files
-    assert accuracy > 0.975
-    few = slice(None, None, 16)
-    units = list(patches.patches[few].astype(np.float32) / 255)
+    assert accuracy > 0.95
+    units = list(patches[::2].astype(np.float32) / 255)
     with pytest.warns(
         UserWarning, match="the scaler was fitted on values 0-1, but the image has values 0-255"
     ):
-        hot, *_ = hot_windows(units, patches.labels[few])
+        hot, *_ = hot_windows(units, labels[::2])
     assert len(hot) > 120

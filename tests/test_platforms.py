@@ -1,6 +1,7 @@
 """Windows and macOS: calls that only POSIX systems have, and the import of all modules without them."""
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -48,11 +49,16 @@ GUARDED = {
 """Uses of what only POSIX has, by module, function and name, and why they do no harm elsewhere."""
 
 
+@functools.cache
+def modules():
+    paths = {".".join(path.relative_to(FOLDER).with_suffix("").parts): path for path in FOLDER.rglob("*.py")}
+    return {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in paths.items()}
+
+
 def posix_uses():
     """Yield module, function and name of each use of what only POSIX has."""
-    for path in FOLDER.rglob("*.py"):
-        name = ".".join(path.relative_to(FOLDER).with_suffix("").parts)
-        yield from ((name, function, found) for function, found in _uses(ast.parse(path.read_text()), ""))
+    for name, tree in modules().items():
+        yield from ((name, function, found) for function, found in _uses(tree, ""))
 
 
 def _uses(node, function):
@@ -133,8 +139,8 @@ def test_all_modules_work_without_what_only_posix_has():
 
 
 def test_text_files_have_the_same_line_breaks_everywhere():
-    for path in FOLDER.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for name, tree in modules().items():
+        for node in ast.walk(tree):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
                 named = {keyword.arg for keyword in node.keywords}
-                assert node.func.attr != "write_text" or "newline" in named, f"{path.name} {node.lineno}"
+                assert node.func.attr != "write_text" or "newline" in named, f"{name} {node.lineno}"
