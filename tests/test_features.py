@@ -209,11 +209,9 @@ def test_extraction_does_not_change_its_input_and_shows_its_progress_if_asked(ca
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        (BLANK, r"source must be an \(N, 64, 64, 3\) uint8 RGB array"),
         (PATCHES[:, :32, :32], r"source must be an \(N, 64, 64, 3\)"),
         ([BLANK[:32]], r"source\[0\] must be 64x64 pixels, got 64x32"),
         ([BLANK, BLANK[..., 0]], r"source\[1\] must be .*COLOR_GRAY2RGB"),
-        ("vehicles", "source must be patches or a list of paths, got 'vehicles'"),
         (["missing.png"], "image file missing.png does not exist"),
     ],
 )

@@ -18,7 +18,6 @@ from vehicle_detection.drawing import (
     draw_cell_shares,
     draw_detections,
 )
-from vehicle_detection.errors import InvalidInputError
 
 BLUE = [0, 0, 255]
 
@@ -251,17 +250,3 @@ def test_shares_of_cells_are_drawn_by_sign_and_amount():
 
 
 FOUND = Detections([[600, 400, 700, 490]], [1.25])
-
-
-@pytest.mark.parametrize(
-    ("draw", "message"),
-    [
-        (lambda: draw_boxes(np.zeros((5, 5, 3)), []), r"image must be an \(H, W, 3\) uint8 RGB array"),
-        (lambda: draw_boxes(blank(), [], color="blue"), r"color must be \(red, green, blue\), 0-255 each"),
-        (lambda: draw_boxes(blank(), [], color=(0, 0, 256)), "color must be an integer from 0 to 255"),
-        (lambda: blur_boxes(NOISE, [], region="faces"), "region must be one of 'vehicles', 'plates'"),
-    ],
-)
-def test_malformed_arguments_are_refused(draw, message):
-    with pytest.raises(InvalidInputError, match=message):
-        draw()

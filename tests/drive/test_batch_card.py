@@ -12,21 +12,21 @@ from vehicle_detection.video import probe_video
 
 pytestmark = pytest.mark.usefixtures("private_scratch")
 
-FRAMES, SEGMENTS = 25, 4
+FRAMES, SEGMENTS = 15, 4  # in each segment, which is a second long
 
 
 def test_a_card_of_many_segments_is_one_trip_with_one_identity_per_vehicle(tmp_path):
     card = tmp_path / "card"
     card.mkdir()
     scenes = list(render_drive(frames=FRAMES, shape=(360, 640), scenario="traffic"))
-    # A loop without a jump: forward, then backward. Each segment is a second long.
+    # A loop without a jump: forward, then backward.
     order = [*range(FRAMES), *reversed(range(FRAMES))] * (SEGMENTS // 2)
     for segment in range(SEGMENTS):
         frames = [scenes[number].image for number in order[segment * FRAMES :][:FRAMES]]
-        write_clip(card / f"20260131_0815{segment:02}_F.mp4", frames)
+        write_clip(card / f"20260131_0815{segment:02}_F.mp4", frames, fps=FRAMES)
         if segment < 2:
             mirrored = [np.ascontiguousarray(frame[:, ::-1]) for frame in frames]
-            write_clip(card / f"20260131_0815{segment:02}_R.mp4", mirrored)
+            write_clip(card / f"20260131_0815{segment:02}_R.mp4", mirrored, fps=FRAMES)
     trips = find_trips(card.iterdir(), duration=lambda file: probe_video(file).duration)
     assert [(trip.camera, len(trip.files)) for trip in trips] == [("front", SEGMENTS), ("rear", 2)]
     out = tmp_path / "out"

@@ -335,9 +335,6 @@ def test_a_camera_of_another_size_is_scaled_or_refused():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"fps": 0}, "fps must be a number, greater than 0"),
-        ({"shape": (720,)}, r"shape must be \(height, width"),
-        ({"camera": 1.2}, "camera must be a Camera"),
         ({"own_speed_mps": -1.0}, "own_speed_mps must be a number of at least 0, or one for each frame"),
         ({"own_speed_mps": [1.0]}, "own_speed_mps must be a number of at least 0, or one for each frame"),
         ({"own_speed_mps": "fast"}, "own_speed_mps must be a number of at least 0"),

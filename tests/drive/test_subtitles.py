@@ -114,11 +114,7 @@ def test_empty_and_long_videos(tmp_path):
     [
         ({"path": "found.txt"}, r"path must end in .srt or .ass, got 'found.txt'; write 'found.srt'"),
         ({"path": "none/found.srt"}, "path needs an existing folder"),
-        ({"table": []}, "table must be a TrackTable"),
-        ({"fps": 0}, "fps must be a number, greater than 0"),
         ({"own_speed": 25.0}, "own_speed must be an OwnSpeed, got 25.0; pass what read_own_speed returns"),
-        ({"events": [1]}, "events must be an Event"),
-        ({"units": "nautical"}, "units must be one of 'metric', 'imperial'"),
     ],
 )
 def test_bad_arguments_are_refused(changes, message, tmp_path):

@@ -35,10 +35,7 @@ def test_labelled_frames_of_a_video(tmp_path):
     [
         (("", IMAGES, LABELS), "name must be a non-empty string, got ''"),
         (("a", [], LABELS), "frames must hold at least one image"),
-        (("a", IMAGES, LABELS, 1.5), "horizon must be a number, at least 0 and at most 1"),
         (("a", IMAGES, LABELS.renamed(lambda key: key + 10)), "labels must name the frames, such as "),
-        (("a", IMAGES, [[0, 0, 9, 9]]), "labels must be a TrackTable, got .*; read a file with read_labels"),
-        (("a", "frames", LABELS), "frames must be a list of images"),
     ],
 )
 def test_invalid_labelled_frames(arguments, message):

@@ -309,13 +309,9 @@ def test_an_error_in_the_results_leaves_the_earlier_file(tmp_path, name):
     ("results", "options", "message"),
     [
         (RESULTS, {"path": "t.xlsx"}, r"path must end in .csv, .*, got 't.xlsx'; or set the format to 'csv'"),
-        (RESULTS, {"format": "excel"}, "format must be one of 'csv', 'jsonl', 'parquet', 'mot', 'coco'"),
-        (RESULTS, {"path": None}, "path must be a file name"),
         (RESULTS, {"path": "missing/t.csv"}, "path needs an existing folder"),
         (RESULTS, {"path": "."}, "path must"),
-        (RESULTS, {"fps": 0}, "fps must be a number, greater than 0"),
         (7, {}, "results must be a list of FrameResult or a TrackTable, got 7"),
-        ("rows", {}, "results must be a list"),
         (pd.DataFrame({"frame": [0]}), {}, "TrackTable.from_pandas"),
         (RESULTS, {"path": "yolo", "format": "yolo"}, r"shape must be \(height, width\)"),
         (RESULTS, {"path": "f", "format": "yolo", "shape": (9, 9)}, "path must be a new or empty folder"),

@@ -31,13 +31,7 @@ RESULT = FrameResult(0, None, NONE, NONE, ())
             {"pix_per_cell": [16]},
             "images.0. must have at least the size",
         ),
-        ("show_images", [[IMAGE]], {"figure": 3}, "figure must be .* pass a Figure"),
-        ("show_images", [IMAGE], {}, "images must be a list of images.* wrap a single one in a list"),
-        ("show_images", [[IMAGE / 255]], {}, r"images\[0\] must be .* scale its values 0-1"),
-        ("show_images", [[IMAGE], ["a", "b"]], {}, "titles"),
         ("show_images", [[IMAGE]], {"boxes": [[1, 2, 3, 4]]}, r"boxes\[0\]"),
-        ("plot_patches", [PATCHES], {"labels": [1]}, "labels"),
-        ("plot_patches", [PATCHES], {"captions": ["a"]}, "captions"),
         ("plot_errors", [FRAMES, BOXES.renamed(lambda key: key + 5)], {}, "predictions hold frame 5"),
         ("plot_precision_recall", [(np.ones(2), np.ones(3), np.ones(2))], {}, "curves"),
         ("plot_precision_recall", [{"a": (np.ones(0),) * 3}], {}, r"curves\['a'\] must be computed from"),
@@ -47,7 +41,6 @@ RESULT = FrameResult(0, None, NONE, NONE, ())
         ("plot_tracks", [[]], {}, "results must hold at least one track"),
         ("plot_tracks", [[RESULT]], {}, "results must hold at least one track"),
         ("plot_tracks", [BOXES.renamed(str)], {}, "results must have numbered frames"),
-        ("plot_tracks", [BOXES], {"truth": "t.csv"}, "truth must be .* read_labels"),
     ],
 )
 def test_a_malformed_argument_is_named(name, arguments, options, argument):

@@ -120,12 +120,9 @@ def test_a_nearer_vehicle_occludes_a_farther_one():
 @pytest.mark.parametrize(
     ("options", "refused"),
     [
-        ({"shape": (720,)}, r"shape must be \(height, width\) in pixels"),
         ({"shape": (20, 640)}, r"shape\[0\]"),
         ({"shape": (640.5, 640)}, r"shape\[0\]"),
         ({"vehicles": [20]}, r"vehicles\[0\] must be a SceneVehicle, got 20; make one with"),
-        ({"lane": 3}, "lane"),
-        ({"light": "noon"}, "light must be one of 'day', 'overcast', 'dusk', 'night'"),
     ],
 )
 def test_invalid_options(options, refused):

@@ -106,20 +106,6 @@ def test_a_detector_may_be_a_model(clip):
     assert [result.frame for result in results] == [None, None]
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"frames": "yes"}, "frames must be True or False; got 'yes'"),
-        ({"every": 0}, "every must be an integer from 1"),
-        ({"source": "missing.mp4"}, r"source missing\.mp4 does not exist"),
-        ({"detector": 3}, "detector must have the methods search, track and reset"),
-    ],
-)
-def test_bad_arguments(clip, detector, options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        track(**{"source": clip, "detector": detector, **options})
-
-
 def test_results_without_frames_cannot_be_written(clip, detector, tmp_path):
     with pytest.raises(InvalidInputError, match="results must hold their frames; pass frames=True to track"):
         write_video(track(clip, detector), tmp_path / "out.mp4", detector.annotator)

@@ -533,8 +533,9 @@ def test_a_server_that_sends_too_little_fails_at_a_deadline(folder, tmp_path, mo
             request.wfile.write(data[place : place + 1])
             time.sleep(0.2)
 
+    monkeypatch.setattr(remote, "_RETRY_DELAYS", (0,))
     for module in (ffmpeg_module, reading, web):
-        monkeypatch.setattr(module, "NETWORK_DEADLINE", 1.5)
+        monkeypatch.setattr(module, "NETWORK_DEADLINE", 1.0)
     with server(serve) as address:
         with pytest.raises(TransientVideoError, match=r"slow.mp4 cannot be copied \(only"):
             remote.download(f"{address}/slow.mp4", tmp_path)
@@ -581,7 +582,7 @@ def test_the_first_frame_of_a_live_source_waits_for_its_reader(stream, read):
 def test_a_network_stream_that_breaks_off_is_opened_again(clip, tmp_path, monkeypatch, caplog, fault):
     monkeypatch.setattr(live, "_RECONNECT_DELAYS", (0.05, 0.1, 0.1))
     if fault == "stalls":
-        monkeypatch.setattr(live, "NETWORK_TIMEOUT", 2.0)
+        monkeypatch.setattr(live, "NETWORK_TIMEOUT", 1.2)
     # ffmpeg reads seconds of a stream before it yields a frame.
     frames = 20 if fault == "ends" else 240
     loop = ("-stream_loop", frames // 20 - 1)
@@ -687,7 +688,7 @@ def test_times_may_be_numbers_of_numpy(tmp_path):
 
 def test_side_outputs_of_a_live_source_that_drops_frames(tmp_path):
     """On most machines, the search of every frame by one worker is slower than the source."""
-    noise = ["-f", "lavfi", "-i", "testsrc2=size=1920x1080:rate=60:duration=2", "-c:v", "libx264"]
+    noise = ["-f", "lavfi", "-i", "testsrc2=size=1920x1080:rate=60:duration=1", "-c:v", "libx264"]
     encoder = [FFMPEG_BINARY, "-v", "quiet", "-re", *noise, "-preset", "ultrafast", "-f", "mpegts", "pipe:1"]
     names = {"output": "a.mp4", "tracks": "a.csv", "srt": "a.srt", "report": "a.html", "events": "e.csv"}
     command = [sys.executable, "-m", "vehicle_detection", "video", "-", "--live", "--every=1", "--jobs=1"]

@@ -144,25 +144,17 @@ def test_a_report_without_frames():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"start": -1}, "start must be a number, at least 0"),
-        ({"end": "2"}, "end must be a number"),
         ({"start": float("nan")}, "start must be a number"),
         ({"start": 2, "end": 1}, "end must be later than the start; got 2 s to 1 s"),
         ({"end": 0}, "end must be later than the start; got 0 s to 0 s"),
         ({"start": 60}, r"start must be less than the video's length of 0\.\d+ s; got 60 s"),
         ({"start": 0.001, "end": 0.002}, "end must be at least one frame later than the start, at 29.97"),
-        ({"jobs": 0}, "jobs must be an integer at least 1"),
-        ({"on_result": 3}, "on_result must be a function"),
         ({"detector": object()}, "detector must have the methods .* without search; pass a VehicleDetector"),
-        ({"source": "missing.mp4"}, "source missing.mp4 does not exist"),
         ({"source": "."}, r"source \. holds no videos and no images; check the path"),
-        ({"source": None}, "source must be the path of a video file"),
         ({"source": os.devnull}, "is not a regular file"),
         ({"target": "missing/out.mp4"}, "target needs an existing folder"),
         ({"target": "."}, "target must be a file, got the folder"),
         ({"target": "out.gif"}, r"target must end in .mp4 or .*, got 'out.gif'; write 'out.mp4'"),
-        ({"target": 7}, "target must be the path"),
-        ({"encoding": "fast"}, "encoding must be"),
     ],
 )
 def test_bad_arguments(clip, tmp_path, monkeypatch, options, message):
