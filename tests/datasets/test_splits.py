@@ -204,10 +204,11 @@ def test_the_real_splits_leak_as_documented(real_patches):
 
 @pytest.mark.realdata
 def test_the_real_groups_do_not_leak(real_patches):
-    split = split_groups(real_patches)
-    assert_covers(split, 17760)
-    assert split_leakage(real_patches, split, threshold=0.9) == 0
-    assert real_patches[split.test].counts() == real_patches[split_sequences(real_patches).test].counts()
+    some = real_patches[::3]
+    split = split_groups(some)
+    assert_covers(split, 5920)
+    assert split_leakage(some, split, threshold=0.9) == 0
+    assert some[split.test].counts() == some[split_sequences(some).test].counts()
 
 
 # Near duplicates

@@ -6,13 +6,13 @@ from vehicle_detection.scenes import render_patches
 
 
 def test_shapes_labels_and_seed():
-    patches, labels = render_patches(21, random_state=3)
-    assert patches.shape == (21, 64, 64, 3)
+    patches, labels = render_patches(7, random_state=3)
+    assert patches.shape == (7, 64, 64, 3)
     assert patches.dtype == np.uint8
     assert labels.dtype == bool
-    assert labels.tolist() == [True] * 11 + [False] * 10
-    assert patches.tobytes() == render_patches(21, random_state=3)[0].tobytes()
-    assert patches.tobytes() != render_patches(21, random_state=4)[0].tobytes()
+    assert labels.tolist() == [True] * 4 + [False] * 3
+    assert patches.tobytes() == render_patches(7, random_state=3)[0].tobytes()
+    assert patches.tobytes() != render_patches(7, random_state=4)[0].tobytes()
 
 
 def test_size():
