@@ -434,6 +434,7 @@ class BandFilters:
 
     def __init__(self, params: FeatureParams, functions: Sequence[tuple[NDArray[np.float64], float]]) -> None:
         self.params = params
+        self._workspace = Workspace()
         _check_shareable(params)
         self.cells_per_window = params.cells  # along a side
         self.bins_per_cell = params.spatial_size // params.cells
@@ -515,11 +516,11 @@ class BandFilters:
 
     def _hog_maps(self, source: NDArray[Any]) -> list[NDArray[np.float32]]:
         """Compute the blocks of HOG and, if used, of coarse HOG; each ``(channels, rows, columns)``."""
-        params = self.params
+        params, workspace = self.params, self._workspace
         cells = kernels.hog_cells(source, params.orient, params.pix_per_cell, params.transform_sqrt)
-        maps = [kernels.hog_blocks(cells, params.cell_per_block)]
+        maps = [kernels.hog_blocks(cells, params.cell_per_block, 1, workspace)]
         if self.coarse:
-            maps.append(kernels.hog_blocks(kernels.pool_cells(cells), params.cell_per_block, dilation=2))
+            maps.append(kernels.hog_blocks(kernels.pool_cells(cells), params.cell_per_block, 2, workspace))
         return [blocks.reshape(-1, *cells.shape[2:]) for blocks in maps]
 
     def _value_map(self, image: NDArray[Any]) -> NDArray[np.float32]:

@@ -227,6 +227,9 @@ class Workspace(threading.local):
         self._arrays: dict[tuple[Any, str], NDArray[Any]] = {}
         self._views: dict[tuple[Any, str, tuple[int, ...]], NDArray[Any]] = {}
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return functools.partial(Workspace, reuse=self._reuse), ()
+
     def take(self, shape: tuple[int, ...], dtype: Any, name: str) -> NDArray[Any]:
         """Return an uninitialized array of `shape`; arrays of the same name and dtype share their memory."""
         if not self._reuse:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._common import NEW_ARRAYS, Workspace
 from vehicle_detection._kernels.jit import jit
 from vehicle_detection.errors import InvalidInputError
 
@@ -75,8 +76,8 @@ def hog_cells(image: NDArray[Any], orient: int, cell: int, transform_sqrt: bool)
     return cells
 
 
-# Values of a row that are processed together: the rows of their gradients and sums stay in the cache.
-_TILE = 768
+# Values of a row that are processed together: the rows of their gradients and sums stay in the first cache.
+_TILE = 312
 
 
 def _sum_magnitudes(image: NDArray[Any], cell: int, cells: NDArray[np.float32]) -> None:
@@ -85,10 +86,9 @@ def _sum_magnitudes(image: NDArray[Any], cell: int, cells: NDArray[np.float32]) 
     orient = cells.shape[1]
     # Mirrored: the gradient at the image's border is zero.
     bordered = cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REFLECT_101).ravel()
-    bounds = np.full(-(-orient // 4) * 4 + 1, -np.inf, np.float32)
-    bounds[:orient] = orientation_cotangents(orient)
+    bounds = orientation_cotangents(orient)
     size = max(1, _TILE // (cell * channels)) * cell * channels
-    gradients, sums, fours = (np.empty((n, size), np.float32) for n in (2, len(bounds), orient))
+    gradients, sums, fours = (np.empty((n, size), np.float32) for n in (2, orient, orient))
     stride = (width + 2) * channels
     sum_magnitudes(bordered, stride, channels, cell, bounds, *gradients, sums, fours, cells)
 
@@ -98,9 +98,9 @@ def sum_magnitudes(image, stride, channels, cell, bounds, quotients, magnitudes,
     """Sum gradient magnitudes into the orientation histograms of cells.
 
     `image` is flat, with a border of a pixel and `stride` values in a row, `cell` the side of a cell in
-    pixels, `bounds` the cotangents of the orientations' lower bounds, from infinite to minus infinite, and
-    `cells` the output ``(channels, orient, cell rows, cell columns)`` float32, means over the cells' pixels.
-    The other arrays are memory for a tile: some cells of a row.
+    pixels, `bounds` the cotangents of the orientations' lower bounds, and `cells` the output
+    ``(channels, orient, cell rows, cell columns)`` float32, means over the cells' pixels. The other arrays
+    are memory for a tile: some cells of a row.
 
     The reference is ``skimage.feature.hog``: central differences without halving, unsigned orientation, hard
     binning. Orientation `k` starts at ``k * 180 / orient`` degrees; an angle in (0, 180) is beyond that bound
@@ -129,38 +129,30 @@ def sum_magnitudes(image, stride, channels, cell, bounds, quotients, magnitudes,
                     quotients[i] = gx / gy if gy != zero else np.float32(np.inf)
                     magnitudes[i] = magnitude
                     total[i] += magnitude
-                # Four bounds at a time: each loaded quotient is compared four times.
-                for k in range(1, orient, 4):
-                    b0, b1 = bounds[k], bounds[k + 1]
-                    b2, b3 = bounds[k + 2], bounds[k + 3]
-                    t0, t1 = sums[k], sums[k + 1]
-                    t2, t3 = sums[k + 2], sums[k + 3]
+                for k in range(1, orient):
+                    bound, within = bounds[k], sums[k]
                     for i in range(n):
-                        q, m = quotients[i], magnitudes[i]
-                        t0[i] += m if q <= b0 else zero
-                        t1[i] += m if q <= b1 else zero
-                        t2[i] += m if q <= b2 else zero
-                        t3[i] += m if q <= b3 else zero
+                        within[i] += magnitudes[i] if quotients[i] <= bound else zero
             # Sums of four columns at every position: adjacent values, unlike the columns of a cell, are added
             # as vectors.
             source, parts, jump = sums, cell, one
             if cell % 4 == 0:
                 source, parts, jump = fours, cell // 4, np.uintp(4 * channels)
                 for k in range(orient):
-                    t0 = sums[k]
+                    within = sums[k]
                     for i in range(np.uintp(n) - three):
-                        fours[k, i] = (t0[i] + t0[i + one]) + (t0[i + two] + t0[i + three])
+                        fours[k, i] = (within[i] + within[i + one]) + (within[i + two] + within[i + three])
             for column in range(n // span):
                 for channel in range(channels):
                     past = zero  # nothing is beyond the last bound
                     for k in range(orient - 1, -1, -1):
                         at = np.uintp(column * span + channel)
-                        within = source[k, at]
+                        part = source[k, at]
                         for _ in range(1, parts):
                             at += jump
-                            within += source[k, at]
-                        cells[channel, k, row, start // span + column] = (within - past) * scale
-                        past = within
+                            part += source[k, at]
+                        cells[channel, k, row, start // span + column] = (part - past) * scale
+                        past = part
 
 
 @jit
@@ -207,7 +199,9 @@ def pool_cells(cells: NDArray[np.float32]) -> NDArray[np.float32]:
     return pooled
 
 
-def hog_blocks(cells: NDArray[np.float32], block: int, dilation: int = 1) -> NDArray[np.float32]:
+def hog_blocks(
+    cells: NDArray[np.float32], block: int, dilation: int = 1, workspace: Workspace = NEW_ARRAYS
+) -> NDArray[np.float32]:
     """Normalize overlapping blocks of cells by L2-Hys: L2, clip at 0.2, L2 again.
 
     `block` is the side of a block in cells and `dilation` the distance of its cells: 1, or 2 for pooled ones.
@@ -220,56 +214,55 @@ def hog_blocks(cells: NDArray[np.float32], block: int, dilation: int = 1) -> NDA
     the constants of scikit-image.
     """
     channels, orient, rows, columns = cells.shape
-    blocks = np.empty((channels, block, block, orient, rows, columns), np.float32)
+    # To get as much new memory from the system takes longer than all that follows.
+    shape = channels, block, block, orient, rows, columns
+    blocks: NDArray[np.float32] = workspace.take(shape, np.float32, f"blocks {dilation}")
     height, width = rows - (block - 1) * dilation, columns - (block - 1) * dilation
     blocks[..., height:, :], blocks[..., width:] = 0, 0
-    flat, flat_blocks = cells.reshape(channels, orient, -1), blocks.reshape(channels, -1, rows * columns)
-    energy, memory = np.empty(rows * columns, np.float32), np.empty((2, width), np.float32)
-    normalize_blocks(flat, block, dilation, height, columns, energy, *memory, flat_blocks)
+    # Positions count through all rows; blocks across the ends of rows are not used.
+    flat = cells.reshape(channels, orient, -1)
+    offsets = [(i * columns + j) * dilation for i in range(block) for j in range(block)]
+    count = max(0, rows * columns - offsets[-1])
+    energy = np.add.reduce(flat * flat, axis=1)
+    squares = np.full((channels, count), 1e-10, np.float32)
+    for offset in offsets:
+        squares += energy[:, offset : offset + count]
+    scales = 1 / np.sqrt(squares)
+    flat_blocks, row = blocks.reshape(channels, -1, rows * columns), np.empty(width, np.float32)
+    normalize_blocks(flat, scales, np.array(offsets, np.uintp), height, columns, row, flat_blocks)
     return blocks
 
 
 @jit
-def normalize_blocks(cells, block, dilation, height, columns, energy, scale, squares, blocks):
-    """Normalize `height` rows of blocks; see `hog_blocks`.
+def normalize_blocks(cells, scales, offsets, height, columns, squares, blocks):
+    """Scale, clip and scale again `height` rows of blocks; see `hog_blocks`.
 
-    `cells` is ``(channels, orient, n)`` and `blocks` the output ``(channels, block * block * orient, n)``,
-    with the rows of cells one after the other. The arrays between them are memory for one channel and for one
-    row.
+    `cells` is ``(channels, orient, n)``, with the rows of cells one after the other, `scales`
+    ``(channels, n)`` the factor of the block that starts at each cell, `offsets` the distances of a block's
+    cells from its first one, and `blocks` the output ``(channels, cells of a block * orient, n)``. `squares`
+    is memory for a row of blocks.
     """
-    orient, width = cells.shape[1], np.uintp(len(scale))
-    zero, one, eps, clip = np.float32(0), np.float32(1), np.float32(1e-10), np.float32(0.2)
+    one, eps, clip = np.float32(1), np.float32(1e-10), np.float32(0.2)
+    orient, width = cells.shape[1], np.uintp(len(squares))
     for channel in range(cells.shape[0]):
-        energy[:] = zero
-        for k in range(orient):
-            values = cells[channel, k]
-            for i in range(len(values)):
-                energy[i] += values[i] * values[i]
+        factors = scales[channel]
         for y in range(height):
             start = np.uintp(y * columns)
             squares[:] = eps
-            for cell in range(block * block):
-                at = np.uintp((y + cell // block * dilation) * columns + cell % block * dilation)
-                for x in range(width):
-                    squares[x] += energy[at + x]
-            for x in range(width):
-                scale[x] = one / np.sqrt(squares[x])
-            squares[:] = eps
             for index in range(blocks.shape[1]):
-                cell = index // orient
                 values, out = cells[channel, index % orient], blocks[channel, index]
-                at = np.uintp((y + cell // block * dilation) * columns + cell % block * dilation)
+                at = start + offsets[index // orient]
                 for x in range(width):
-                    value = values[at + x] * scale[x]
+                    value = values[at + x] * factors[start + x]
                     value = value if value < clip else clip
                     out[start + x] = value
                     squares[x] += value * value
             for x in range(width):
-                scale[x] = one / np.sqrt(squares[x])
+                squares[x] = one / np.sqrt(squares[x])
             for index in range(blocks.shape[1]):
                 out = blocks[channel, index]
                 for x in range(width):
-                    out[start + x] *= scale[x]
+                    out[start + x] *= squares[x]
 
 
 def count_bins(image: NDArray[np.uint8], bins: int, cell: int) -> NDArray[np.uint16]:
@@ -369,19 +362,10 @@ def add_root_histograms(
         counts = counts[:-span] + counts[span:]
     for span in spans:
         counts = counts[..., :-span] + counts[..., span:]
-    add_roots(counts, weights.reshape(len(weights), -1), scores)
-
-
-@jit
-def add_roots(counts, weights, scores):
-    """Add weighted square roots of counts ``(rows, bins, columns)`` to ``scores[template, row, column]``."""
-    for template in range(scores.shape[0]):
-        for row in range(scores.shape[1]):
-            out = scores[template, row]
-            for k in range(counts.shape[1]):
-                weight, line = weights[template, k], counts[row, k]
-                for x in range(out.shape[0]):
-                    out[x] += weight * np.sqrt(np.float32(line[x]))
+    # A window of one cell: its bins are the channels.
+    roots = np.sqrt(counts.transpose(1, 0, 2), order="C", dtype=np.float32)
+    for each, out in zip(weights.reshape(len(weights), 1, 1, -1), scores):
+        add_correlation(roots, each, 1, out)
 
 
 def add_correlation(
