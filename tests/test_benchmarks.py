@@ -5,7 +5,6 @@ import sys
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from benchmarks import _batch, _drives, _lenses, _report
 from benchmarks._course import search_course
@@ -147,36 +146,6 @@ def test_results_of_another_machine_or_a_damaged_file_are_replaced(tmp_path, mon
     assert list(json.loads(file.read_text(encoding="utf-8"))["benchmarks"]) == ["third"]
 
 
-def test_table_shows_measured_target_and_verdict():
-    console = Console(width=120)
-    rows = [
-        Row("memory", 12.34, unit="MB", target=at_most(20), material="drawn"),
-        Row("windows", 11580),
-        Row("F1", 0.98765, target=at_least(1)),
-    ]
-    with console.capture() as capture:
-        _report.print_table({"things": rows}, console)
-    lines = [" ".join(line.replace("│", " ").split()) for line in capture.get().splitlines()]
-    assert "memory 12.3 MB ≤ 20 MB met" in lines
-    assert "windows 11,580" in lines
-    assert "F1 0.9877 ≥ 1 missed" in lines
-    assert "things (drawn)" in lines
-
-
-@pytest.mark.parametrize("cpus", [[0, 1], []])
-def test_workers_are_compared(tmp_path, monkeypatch, cpus):
-    seconds = {1: 8.0, 2: 5.0}
-    monkeypatch.setattr(_batch, "two_cpus", lambda: cpus)
-    monkeypatch.setattr(_batch, "_process_all", lambda *_, **__: 7.9)
-    monkeypatch.setattr(_batch, "_batch", lambda trips, out, jobs, **_: seconds[jobs])
-    monkeypatch.setattr(_batch, "_bound_batch", lambda trips, out, used, **_: 2 * seconds[len(used)])
-    rows = _batch._compare_workers(tmp_path, tmp_path, 2, tracks_only=True)
-    found = {row.what.removeprefix("tracks only: "): (row.value, row.target) for row in rows}
-    assert found["one worker to process_video"] == (8 / 7.9, at_most(1.1))
-    assert found["two workers to one"] == (1.6, None if cpus else at_least(1.8))
-    assert found.get("two workers to one, bound to a CPU each") == ((1.6, at_least(1.8)) if cpus else None)
-
-
 def test_a_bound_batch_uses_one_cpu(tmp_path):
     if not _batch.two_cpus():
         pytest.skip("CPUs cannot be bound here, or there is one only")
@@ -221,13 +190,3 @@ def test_frames_between_searched_ones_are_scored():
     assert searched == [0, 2, 4]
     assert [result.index for result in results] == [0, 1, 2, 3, 4, 5]
     assert [result.searched for result in results] == [True, False] * 3
-
-
-def test_range_errors_are_pooled_over_drives():
-    first = np.array([[11.0, 10.0, 1.0, 0.0, 0.0], [np.nan, 20.0, np.nan, 0.0, 0.0]])
-    second = np.array([[13.0, 10.0, 2.0, 0.0, 1.0]])
-    errors = _drives.range_errors([first, second])
-    assert errors.distance == pytest.approx(20)
-    assert errors.distance_90 == pytest.approx(28)
-    assert errors.speed == pytest.approx(1.5)
-    assert np.isnan(_drives.range_errors([]).distance)

@@ -229,11 +229,6 @@ def test_invalid_camera_files(tmp_path, text, message):
         read_camera(path)
 
 
-def test_a_missing_camera_file(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"^camera file .+ does not exist; check the path"):
-        read_camera(tmp_path / "camera.json")
-
-
 @pytest.mark.parametrize("lens", ["standard-58", "fisheye-120"])
 def test_a_camera_of_another_size_rectifies_as_one_of_this_size(lens):
     large, small = (Camera.for_frame(shape, lens=lens) for shape in ((720, 1280), (360, 640)))

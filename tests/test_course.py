@@ -683,35 +683,24 @@ def test_labeled_boxes_are_drawn_on_a_part_of_an_image():
 
 # As in published systems, where those of `test_course_systems` differ; with the shape of what is returned.
 CALL_FORMS = [
-    ("get_hog_features(d.gray, 9, 8, 2, False, True)", (1764,)),
     ("get_hog_features(d.gray, 9, 8, 2, vis=True, feature_vec=False)[0]", (7, 7, 2, 2, 9)),
     ("get_hog_features(d.gray, 9, 8, 2, visualise=True, feature_vec=True)[1]", (64, 64)),
-    ("get_hog_features(img=d.gray, orient=9, pix_per_cell=8, cell_per_block=2, vis=False)", (1764,)),
     ("get_hog_features(d.patch[:, :, 0], 11, 16, 2, vis=False, feature_vec=True)", (396,)),
-    ("bin_spatial(d.patch)", (3072,)),
     ("bin_spatial(d.patch, size=16)", (768,)),
     ("bin_spatial(d.patch, 'HSV', (16, 16))", (768,)),
     ("bin_spatial(d.patch, color_space='HSV', size=(32, 32))", (3072,)),
-    ("color_hist(d.patch)", (96,)),
     ("color_hist(d.patch / 255, 32, (0, 1))", (96,)),
-    ("convert_color(d.image, 'BGR2YCrCb')", (208, 330, 3)),
-    ("extract_features(d.files, 'YCrCb', (16, 16), 32, 9, 8, 2, 'ALL', True, True, True)", (3, 6156)),
     ("extract_features(d.files, cspace='YUV', orient=9, pix_per_cell=8, cell_per_block=2, "
      "hog_channel='ALL')", (3, 5292)),
     ("extract_features(d.files, cspace='RGB', spatial_size=(32, 32), hist_bins=32, "
      "hist_range=(0, 256))", (3, 3168)),
-    ("extract_features(list(d.patches), spatial_feat=False, hist_feat=False)", (3, 1764)),
-    ("single_img_features(d.patch, 'YCrCb', (16, 16), 32, 9, 8, 2, 'ALL', True, True, True)", (6156,)),
     ("slide_window(d.image, y_start_stop=(90, 200), xy_window=[48, 48])", (36, 2, 2)),
-    ("draw_boxes(d.image, d.boxes, color=(255, 0, 0), thick=3)", (208, 330, 3)),
     ("search_windows(d.image, [], clf=d.svc, scaler=d.scaler, color_space='YCrCb', spatial_size=(16, 16), "
      "hist_bins=16, hog_channel='ALL')", (0,)),
     ("find_cars(img=d.image, ystart=90, ystop=200, scale=1, svc=d.svc, X_scaler=d.scaler, orient=9, "
      "pix_per_cell=8, cell_per_block=2, spatial_size=(16, 16), hist_bins=16, divide_by=1)", (208, 330, 3)),
     ("find_car_windows(d.image, 0, 60, 1, d.svc, d.scaler, 9, 8, 2, 16, 16, divide_by=1)", (0,)),
     ("find_car_windows(d.image, 0, 200, 500.0, d.svc, d.scaler, 9, 8, 2, 16, 16, divide_by=1)", (0,)),
-    ("apply_threshold(heatmap=d.heat, threshold=2)", (208, 330)),
-    ("draw_labeled_bboxes(np.copy(d.image), labels=d.labels)", (208, 330, 3)),
 ]  # fmt: skip
 
 
@@ -742,11 +731,8 @@ def test_every_call_form_binds(call_data, form, shape):
             "transform_sqrt must be False",
         ),
         ("bin_spatial(d.gray, 'HLS', 8)", "color_space must be RGB for one channel; got 'HLS'"),
-        ("bin_spatial(d.patch, (1, 2, 3))", "size must be"),
         ("bin_spatial(d.patch, 8, 8)", "takes an image and a size; got 1 more"),
         ("color_hist(d.patch, 4, (5, 5))", "bins_range must be a number, greater than 5"),
-        ("color_hist(d.patch, 4, 256)", "bins_range must be .low, high."),
-        ("color_hist(d.patch.astype(int))", "must be uint8 or float"),
         ("convert_color(d.patch, 'RGB2CMYK')", "conv or color_space must be"),
         ("extract_features('car.png')", "list of file names"),
         ("extract_features(d.patch)", r"list of images, .*pass \[image\], or use single_img_features"),
@@ -757,16 +743,11 @@ def test_every_call_form_binds(call_data, form, shape):
             "HOG quiz .*: cspace='YCrCb', orient=9, pix_per_cell=8, cell_per_block=2, hog_channel=1",
         ),
         ("extract_features(['missing.png'])", "does not exist"),
-        ("extract_features(d.files, hog_channel=3)", "hog_channel must be one of"),
         ("extract_features(d.files, spatial_feat=0, hist_feat=0, hog_feat=0)", "all False"),
-        ("slide_window((720, 1280))", "img must be an image"),
-        ("slide_window(d.image, [0, 9.5])", "x_start_stop must be"),
         ("slide_window(d.image, [9, 5])", "0 <= start <= stop"),
-        ("slide_window(d.image, xy_window=64)", "xy_window must be a pair"),
         ("slide_window(d.image, xy_overlap=(0.5, 1))", "xy_overlap must leave a step"),
         ("search_windows(d.image, [((0, 0), (0, 9))], d.svc, d.scaler, **d.options)", "non-empty"),
         ("search_windows(d.image, [((330, 0), (340, 9))], d.svc, d.scaler, **d.options)", "330x208 image"),
-        ("search_windows(d.image, [[1, 2, 3]], d.svc, d.scaler, **d.options)", "corner pairs"),
         ("search_windows(d.image, d.boxes, d.svc, d.scaler)", "fitted on 6108 features, but these options"),
         ("search_windows(d.image, d.boxes, d.scaler, d.svc)", "classifier must have a method predict"),
         (
@@ -774,10 +755,8 @@ def test_every_call_form_binds(call_data, form, shape):
             "scaler must be fitted; got an unfitted StandardScaler",
         ),
         ("find_cars(d.image, 90, 90, 1, d.svc, d.scaler, 9, 8, 2, 16, 16)", "ystart and ystop"),
-        ("find_cars(d.image, 90, 200, 0, d.svc, d.scaler, 9, 8, 2, 16, 16)", "scale must be a number"),
         ("find_cars(d.image, 90, 200, 1, d.svc, d.scaler, 9, 64, 2, 16, 16)", "must fit into a window"),
         ("find_cars(d.image, 9, 99, 1, d.svc, d.scaler, 9, 8, 2, 16, 16, resize='first')", "resize must be"),
-        ("add_heat(d.patch, d.boxes)", "heatmap must be an"),
         ("add_heat(d.heat, [((9, 9), (5, 5))])", "x1 <= x2"),
         *(
             (f"add_heat(d.heat, {boxes})", "bbox_list must be .*find_cars returns a picture, find_car_w")
@@ -785,10 +764,7 @@ def test_every_call_form_binds(call_data, form, shape):
         ),
         ("draw_boxes(d.image, d.image)", "bboxes must be .*find_car_windows returns the boxes"),
         ("draw_boxes(d.image[..., [0, 1, 2, 0]], [])", r"drop the alpha channel with img\[\.\.\., :3\]"),
-        ("draw_boxes(d.image, d.boxes, color='red')", "color must be"),
-        ("draw_boxes(d.image, d.boxes, thick=1.5)", "thick must be an integer"),
         ("draw_labeled_bboxes(d.image[:, ::-1], d.labels)", "writable and contiguous"),
-        ("draw_labeled_bboxes(d.image.copy(), d.labels[0])", "labels must be the pair"),
     ],
 )
 def test_bad_input_raises_an_error_of_the_library(call_data, models, form, message):

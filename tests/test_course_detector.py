@@ -209,16 +209,9 @@ def test_it_finds_the_vehicles_of_the_courses_images(real_data):
         ({"orient": 9}, r"must be omitted with a model of the library, .*'orient'"),
         ({"clf": LinearSVC()}, "or a fitted classifier with a scaler; got LinearSVC"),
         ({"clf": None}, "clf must be a model of the library"),
-        ({"scales": 1.5}, "scales must be"),
         ({"scales": (0,)}, "scales must be a number"),
-        ({"y_start_stop": (-1, 656)}, "scales must hold"),
         ({"y_start_stop": (400, 400)}, "scales must hold"),
         ({"scales": [(1.0, 400, 656)]}, "scales must hold"),
-        ({"cells_per_step": 0}, "cells_per_step must be an integer"),
-        ({"n_frames": 0}, "n_frames must be an integer"),
-        ({"threshold": -1}, "threshold must be a number"),
-        ({"smoother": 3}, "smoother must be"),
-        ({"method": 3}, "method must be one of 1, 2"),
     ],
 )
 def test_invalid_arguments_are_rejected(arguments, message):

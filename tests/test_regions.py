@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from vehicle_detection.boxes import Detections, iou_matrix
 from vehicle_detection.camera import Camera
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.regions import RegionParams, find_vehicles, fit_boxes, group_windows
 
 SHAPE = (720, 1280)
@@ -277,13 +276,3 @@ class TestDefaults:
         whole, flank = [1000.0, 380, 1160, 540], [960.0, 400, 1050, 490]
         boxes = fit_boxes(groups_of([whole, flank], [3.0, 1.5]), CAMERA, SHAPE, DEFAULT)
         assert boxes.scores.tolist() == [3.0]
-
-
-def test_find_vehicles_checks_its_arguments():
-    camera = Camera.for_frame((720, 1280))
-    with pytest.raises(InvalidInputError, match=r"windows must be a Detections, .*; pass Detections\(boxes"):
-        find_vehicles(np.zeros((2, 4)), camera, (720, 1280))
-    with pytest.raises(InvalidInputError, match=r"shape must be .*; pass image.shape"):
-        find_vehicles(Detections.empty(), camera, np.zeros((72, 128, 3), np.uint8))
-    with pytest.raises(InvalidInputError, match="camera must be a Camera"):
-        find_vehicles(Detections.empty(), (720, 1280), (720, 1280))

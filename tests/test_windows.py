@@ -10,7 +10,6 @@ from vehicle_detection import course
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, single_img_features
 from vehicle_detection.search import SearchParams
-from vehicle_detection.training import to_pipeline
 from vehicle_detection.windows import band_windows, search_windows, slide_window
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
@@ -161,16 +160,3 @@ def test_both_borders_differ_only_in_the_gradients():
 def test_search_windows_rejects_invalid_windows(windows, message):
     with pytest.raises(InvalidInputError, match=message):
         search_windows(IMAGE, windows, CLASSIFIER)
-
-
-def test_search_windows_rejects_other_invalid_arguments():
-    window = [[0, 0, 64, 64]]
-    with pytest.raises(InvalidInputError, match="image must be an"):
-        search_windows(IMAGE / 255, window, CLASSIFIER)
-    with pytest.raises(InvalidInputError, match="min_score must be a number"):
-        search_windows(IMAGE, window, CLASSIFIER, min_score=np.nan)
-    with pytest.raises(InvalidInputError, match=r"classifier must be a VehicleClassifier, .*from_pipeline"):
-        search_windows(IMAGE, window, to_pipeline(CLASSIFIER))
-    for off_grid in ([[3, 0, 67, 64]], [[0, 0, 48, 48]]):
-        with pytest.raises(InvalidInputError, match="windows must be 64x64 pixels, at multiples of 16"):
-            score_windows(IMAGE, off_grid, CLASSIFIER)

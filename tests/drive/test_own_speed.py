@@ -259,8 +259,6 @@ def test_other_paths_are_refused(tmp_path, monkeypatch):
         read_own_speed(tmp_path / "a.kml")
     with pytest.raises(InvalidInputError, match=r"a.gpx does not exist; check the path"):
         read_own_speed(tmp_path / "a.gpx")
-    with pytest.raises(InvalidInputError, match="offset must be a number"):
-        read_own_speed(tmp_path / "a.gpx", offset="1")
     os.mkfifo(tmp_path / "pipe.gpx")
     with pytest.raises(InvalidInputError, match="is a device or a pipe"):
         read_own_speed(tmp_path / "pipe.gpx")

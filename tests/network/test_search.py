@@ -1,4 +1,3 @@
-import dataclasses
 import multiprocessing
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -12,8 +11,7 @@ from onnx import TensorProto, helper
 from tests.network.graphs import PARAMS, echo_network, own_network, serialize
 from tests.network.test_runtime import NO_OPENVINO, RUNTIMES
 from vehicle_detection.boxes import iou_matrix, logit
-from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.heatmap import HeatParams
+from vehicle_detection.errors import ModelFileError
 from vehicle_detection.network import NetworkParams, load_network
 from vehicle_detection.network.model import to_log_odds, to_probability
 
@@ -147,21 +145,6 @@ def check_inside(found, shape):
         assert (boxes[:, :2] >= 0).all()
         assert (boxes[:, 2:] <= (shape[1], shape[0])).all()
         assert (boxes[:, 2:] > boxes[:, :2]).all()
-
-
-def test_malformed_arguments(model, tmp_path):
-    with pytest.raises(InvalidInputError, match="jobs"):
-        model.open_search(jobs=0)
-    with pytest.raises(InvalidInputError, match="params must be a NetworkParams"):
-        find(model, params=HeatParams())
-    with pytest.raises(InvalidInputError, match="slope"):
-        dataclasses.replace(model, slope=0.0)
-    with pytest.raises(InvalidInputError, match="path must be a file name"):
-        load_network(5)
-    with pytest.raises(ModelFileError, match="does not exist"):
-        load_network(tmp_path / "missing.onnx")
-    with pytest.raises(ModelFileError, match="folder"):
-        load_network(tmp_path)
 
 
 def test_a_file_that_is_too_large(file, monkeypatch):

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import check_truth
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes import render_drive
 from vehicle_detection.scenes.drive import LABEL_COLUMNS, SCENARIOS, make_traffic
 
@@ -87,15 +86,6 @@ def test_occlusion_hides_a_car_for_about_a_second(frames, seed):
     assert 0.8 <= sum(hidden) * 3 / drive.fps <= 2.5
     first = hidden.index(True)
     assert all(hidden[first : first + sum(hidden)])
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("frames", 0), ("fps", 0), ("scenario", "race"), ("rough", 2), ("shape", "hd"), ("light", 3)],
-)
-def test_invalid_options(name, value):
-    with pytest.raises(InvalidInputError, match=f"^{name}"):
-        render_drive(**{name: value})
 
 
 def test_labels_contain_the_truth(tmp_path):

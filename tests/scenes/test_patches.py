@@ -1,7 +1,5 @@
 import numpy as np
-import pytest
 
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes import render_patches
 
 
@@ -25,9 +23,3 @@ def test_patches_differ_and_have_contrast():
     contrast = patches.reshape(60, -1).std(1)
     assert contrast[labels].min() > 8
     assert contrast[labels].mean() > contrast[~labels].mean()
-
-
-@pytest.mark.parametrize(("name", "value"), [("n", 0), ("size", 8), ("random_state", 1.5)])
-def test_invalid_options(name, value):
-    with pytest.raises(InvalidInputError, match=f"^{name} must be an integer"):
-        render_patches(**({"n": 2} | {name: value}))

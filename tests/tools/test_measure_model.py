@@ -69,19 +69,3 @@ def test_the_command_writes_the_values(data, tmp_path, capsys):
     found = {row["name"]: row["frames"] for row in written["sets"]}
     assert (found["bdd"], found["dawn"]) == (1, 1)
     assert capsys.readouterr().out.startswith("| set | frames | vehicles | F1 |")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["{data}/none"], "does not exist"),
-        (["{data}", "--sources", "bdd,none"], "lacks labels/none.csv"),
-        (["{data}", "--sources", "bdd", "--rides", "{data}/none.txt"], "none.txt"),
-        (["{data}", "--sources", "bdd", "--model", "{data}/none.safetensors"], "none.safetensors"),
-        (["{data}", "--sources", "bdd", "-o", "{data}/none/out.json"], "--output needs an existing folder"),
-    ],
-)
-def test_bad_arguments(data, capsys, words, message):
-    with pytest.raises(SystemExit):
-        measure_model.main([word.format(data=data) for word in words])
-    assert message in capsys.readouterr().err

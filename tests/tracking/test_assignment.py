@@ -2,7 +2,6 @@ import subprocess
 import sys
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
@@ -26,13 +25,6 @@ def test_the_pairs_are_those_of_scipy(rows, columns, density, with_ties, seed):
         assert sum(cost[pair] for pair in pairs) == sum(cost[pair] for pair in expected)
     else:
         assert pairs == expected
-
-
-@pytest.mark.parametrize("shape", [(60, 60), (60, 20), (1, 40)])
-def test_tables_of_crowded_frames(shape):
-    cost = np.random.default_rng(1).random(shape)
-    expected = np.transpose(linear_sum_assignment(cost)).tolist()
-    assert cheapest_pairs(cost, np.ones(shape, np.bool_)) == [tuple(pair) for pair in expected]
 
 
 def test_the_tracker_does_not_load_scipy_optimize():

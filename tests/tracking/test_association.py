@@ -50,13 +50,6 @@ def test_covered_fractions_are_of_the_first_boxes():
     np.testing.assert_allclose(covered_fractions(second, first), [[0.25, 0.0]])
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(0, 0), (0, 2), (2, 0)])
-def test_nothing_is_matched_with_nothing(rows, columns):
-    assert (
-        match_boxes(random_boxes(np.random.default_rng(0), rows), np.ones((columns, 4)), np.ones(rows)) == []
-    )
-
-
 @pytest.mark.parametrize(("shift", "pairs"), [(40.0, [(0, 0)]), (40.1, [])])
 def test_the_largest_distance_is_inclusive(shift, pairs):
     assert match_boxes(boxes_at((50, 50)), boxes_at((50 + shift, 50)), np.array([1.0])) == pairs
@@ -65,11 +58,6 @@ def test_the_largest_distance_is_inclusive(shift, pairs):
 @pytest.mark.parametrize(("side", "pairs"), [(80.0, [(0, 0)]), (80.5, []), (20.1, [(0, 0)]), (19.8, [])])
 def test_areas_differ_by_a_factor_of_four_at_most(side, pairs):
     assert match_boxes(boxes_at((50, 50)), boxes_at((50, 50), side=side), np.array([1.0])) == pairs
-
-
-def test_each_track_has_its_own_largest_distance():
-    predicted, measured = boxes_at((50, 50), (300, 50)), boxes_at((75, 50), (325, 50))
-    assert match_boxes(predicted, measured, np.array([0.7, 0.6])) == [(0, 0)]
 
 
 def test_pairs_that_overlap_too_little_leave_their_boxes_to_others():

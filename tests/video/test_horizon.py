@@ -83,11 +83,6 @@ def test_the_horizon_of_real_clips(real_data, name, low, high):
     assert found.horizon_std < 0.03
 
 
-def test_a_missing_video(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"missing\.mp4 does not exist"):
-        estimate_video_horizon(tmp_path / "missing.mp4", StubImageDetector(np.empty((0, 4))))
-
-
 def test_a_refused_pipe_is_not_read(clip):
     with open_source(clip) as source:
         source.rereadable = False

@@ -251,8 +251,3 @@ def test_the_first_encoder_that_works_is_chosen(monkeypatch):
     options = " ".join(Encoding(encoder="auto", crf=30).options("null"))
     assert "-vf null,format=nv12,hwupload -c:v h264_vaapi -qp 30" in options
     assert "nvenc" in Encoding(encoder="auto")._options("nvenc", "null")[3]
-
-
-def test_a_missing_graphics_processor_is_noticed():
-    assert encoding._failure("videotoolbox")
-    assert not encoding._failure("x264")
