@@ -168,6 +168,16 @@ def test_a_known_lens_gives_distances_without_a_horizon(detector, expected):
     assert "distance_m" not in expected[0].to_pandas()
 
 
+@pytest.mark.parametrize("lens", [{"fov": 60}, {"lens": "fisheye-140"}])
+def test_distances_depend_on_neither_scores_nor_other_boxes(lens):
+    camera = Camera.for_frame((720, 1280), horizon=0.5, **lens)
+    boxes = np.array([[600, 380, 700, 450], [650, 390, 720, 440], [0, 380, 300, 700], [9, 9, 9, 9]])
+    together = image_distances(Detections(boxes, [3.0, -1.0, 0.5, 1.0]), (720, 1280), camera)
+    alone = [image_distances(Detections(box[None], [2.0]), (720, 1280), camera)[:, 0] for box in boxes]
+    np.testing.assert_allclose(together, np.transpose(alone), rtol=1e-12)
+    assert np.isfinite(together).all(axis=0).tolist() == [True, True, True, False]
+
+
 def test_stated_errors_of_images_hold_without_a_horizon():
     """Near and far vehicles of rendered drives, whose boxes have the errors of a detector."""
     errors, stated = [], []

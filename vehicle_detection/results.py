@@ -17,7 +17,7 @@ from vehicle_detection.camera import Camera
 from vehicle_detection.drawing import draw_detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import image_array, write_image
-from vehicle_detection.tracking import Tracker
+from vehicle_detection.tracking import Tracker, measure_distances
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,14 +86,9 @@ class ImageDetections(Detections):
 def image_distances(found: Detections, shape: tuple[int, ...], camera: Camera) -> Floats:
     """Distances and standard errors of the vehicles of one image, as `ImageDetections.distances`."""
     check.instance(camera, "camera", Camera, "pass Camera.dashcam(fov=90)")
-    values = np.full((2, len(found)), np.nan)
-    # With a frame a second, no error is taken to be shared with frames before. The horizon of a fisheye lens
-    # cannot be estimated.
+    # The horizon of a fisheye lens cannot be estimated.
     if not camera.horizon_is_known and not camera.fisheye:
         tracker = Tracker(camera=camera, fps=1)
         tracker.update(found, shape)
         camera = tracker.camera
-    for row in range(len(found)):
-        for track in Tracker(camera=camera, fps=1).update(found[[row]], shape):
-            values[:, row] = track.distance_m, track.distance_std_m  # None becomes NaN
-    return values
+    return measure_distances(found.boxes, shape, camera)

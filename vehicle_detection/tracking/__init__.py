@@ -1,5 +1,6 @@
 """Tracking: detections of single frames in, vehicles with constant identities out."""
 
+from vehicle_detection.tracking.distance import measure_distances
 from vehicle_detection.tracking.growth import small_gray
 from vehicle_detection.tracking.horizon import HorizonEstimate, estimate_horizon
 from vehicle_detection.tracking.interpolation import (
@@ -33,6 +34,7 @@ __all__ = [
     "estimate_horizon",
     "interpolate_results",
     "is_result",
+    "measure_distances",
     "search_delay",
     "search_interval",
     "shown_tracks",

@@ -21,7 +21,8 @@ import numpy as np
 
 from vehicle_detection._common import Floats
 from vehicle_detection.camera import Camera
-from vehicle_detection.tracking.kalman import Bools, KalmanStates, Measurements
+from vehicle_detection.tracking.kalman import Bools, KalmanSmoother, KalmanStates, Measurements
+from vehicle_detection.tracking.track import TrackParams
 
 DISTANCE, SPEED, WIDTH, LENGTH, HORIZON, CAMERA_HEIGHT, HEIGHT = range(7)
 """Columns of a state."""
@@ -356,3 +357,19 @@ def estimate_distances(
         {name: float(values[row]) if mask[row] else None for name, (values, mask) in columns.items()}
         for row in range(len(distance))
     ]
+
+
+def measure_distances(boxes: Floats, shape: tuple[int, ...], camera: Camera) -> Floats:
+    """Distances and standard errors of the vehicles of one image, ``(2, N)``; NaN where unknown."""
+    seen, params = camera.for_shape(shape), TrackParams()
+    pinhole, (height, width) = seen.to_pinhole(shape), shape[:2]
+    boxes = np.clip(boxes.astype(np.float64), 0.0, [width, height, width, height])
+    inside = (boxes[:, 2:] - boxes[:, :2] >= 1).all(axis=1)
+    measured = Measurements.from_boxes(boxes[inside], (height, width), camera=seen if seen.fisheye else None)
+    states = initiate_states(*KalmanSmoother(params).initiate(measured), pinhole)
+    # With a frame a second, no error of a box is taken to be shared with frames before.
+    states = update_distances(states, measured, pinhole, 1.0, params.measurement_correlation_time)
+    values = np.full((2, len(boxes)), np.nan)
+    estimates = estimate_distances(states, np.zeros(len(states.mean)), pinhole)
+    values[:, inside] = [[each[name] for each in estimates] for name in ("distance_m", "distance_std_m")]
+    return values
