@@ -20,7 +20,7 @@ def test_a_track_of_both_frames_is_interpolated():
     (found,) = interpolate_tracks([first], [second], 0.02, 0.06, SHAPE)
     np.testing.assert_allclose(found.box, [101, 200.5, 151.5, 261])
     assert (found.id, found.state, found.shown) == (3, "confirmed", True)
-    assert found.age == pytest.approx(1.02)
+    assert (found.age, found.time_since_update) == (pytest.approx(1.02), pytest.approx(0.02))
     assert found.distance_m == pytest.approx(19.5)
     assert found.speed_mps == 2.0
     with pytest.raises(ValueError, match="read-only"):
@@ -31,7 +31,7 @@ def test_a_track_that_has_ended_moves_on():
     first = track(1, [100, 200, 150, 260], velocity=(50.0, -25.0), age=2.0)
     (found,) = interpolate_tracks([first], [], 0.04, 0.04, SHAPE)
     np.testing.assert_allclose(found.box, [102, 199, 152, 259])
-    assert found.age == pytest.approx(2.04)
+    assert (found.age, found.time_since_update) == (pytest.approx(2.04), pytest.approx(0.04))
     leaving = track(1, [0, 200, 3, 260], velocity=(-100.0, 0.0))
     assert interpolate_tracks([leaving], [], 0.04, 0.04, SHAPE) == ()
 
@@ -51,7 +51,7 @@ def test_a_track_is_shown_from_its_first_detection_on():
     confirmed = track(5, [104, 200, 154, 260], velocity=(50.0, 0.0), age=0.3)
     (found,) = interpolate_tracks([tentative], [confirmed], 0.04, 0.04, SHAPE)
     np.testing.assert_allclose(found.box, [102, 200, 152, 260])
-    assert (found.id, found.age) == (5, pytest.approx(0.26))
+    assert (found.id, found.age, found.time_since_update > 0) == (5, pytest.approx(0.26), True)
     # Not one that was detected for the first time after this frame.
     new = track(5, [104, 200, 154, 260], age=0.0)
     assert interpolate_tracks([], [new], 0.04, 0.04, SHAPE) == ()

@@ -432,7 +432,7 @@ class SideOutputs:
             pictures: list[vd.drive.TrackPicture] = []
             if options.why:
                 with options.open_source() as again:
-                    pictures = vd.drive.explain_tracks(detector, again, table, every=options.every)
+                    pictures = vd.drive.explain_tracks(detector, again, table)
             self._page.finish(done, events=events, pictures=pictures)
         if options.clips is not None and options.output is not None:
             # Last, because there may be thousands of clips.

@@ -62,7 +62,6 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import Explanation, explain
 from vehicle_detection.heatmap import HeatParams
 from vehicle_detection.tables import TrackTable
-from vehicle_detection.tracking import search_interval
 from vehicle_detection.video import Source, VideoReport, borrow_source
 
 # Part of an image around a window that a picture shows, as a fraction of its longer side; height of the
@@ -234,13 +233,11 @@ def _relative_url(video: Path, page: Path) -> str:
     return urllib.parse.quote(os.fsencode(relative.replace(os.sep, "/")))
 
 
-def explain_tracks(
-    detector: VehicleDetector, source: Source, table: TrackTable, *, every: int | None = None
-) -> list[TrackPicture]:
+def explain_tracks(detector: VehicleDetector, source: Source, table: TrackTable) -> list[TrackPicture]:
     """Explain a box of each of the twelve longest tracks: the largest detected one inside the frame.
 
-    `table` holds the tracks that `detector` found in `source`, which is read again, with the option `every`
-    of `process_video`. The pictures are in the order of the tracks' ids.
+    `table` holds the tracks that `detector` found in `source`, which is read again. The pictures are in the
+    order of the tracks' ids.
     """
     known = [track for track in track_histories(table) if np.isfinite(track.boxes).all(axis=1).any()]
     tracks = sorted(known, key=lambda track: -len(track.frames))[:_MAX_EXPLAINED]
@@ -248,11 +245,10 @@ def explain_tracks(
     with borrow_source(source) as opened:
         shape, fps = opened.info.shape[:2], float(opened.info.fps)
         offset = round((table.first_time or 0.0) * fps)
-        interval = every or (1 if detector.searches_every_frame else search_interval(fps))
         for track in tracks:
             truncated = truncated_edges(track.boxes, shape).any(axis=1)
-            # Predicted boxes have no detection to explain; they are the last choice.
-            detected = (track.columns["time_since_update"] == 0) & (track.frames % interval == 0)
+            # Predicted and interpolated boxes have no detection to explain; they are the last choice.
+            detected = track.columns["time_since_update"] == 0
             weights = np.where(truncated, 0.01, 1.0) * np.where(detected, 1.0, 1e-9)
             row = int(np.nanargmax(weights * box_areas(track.boxes)))
             frame = int(track.frames[row])

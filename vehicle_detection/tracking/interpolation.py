@@ -15,7 +15,7 @@ from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tracking.track import TIME_TOLERANCE, FrameResult, Track, TrackParams
 
-_INTERPOLATED = ("score", "confidence", "age", "time_since_update")
+_INTERPOLATED = ("score", "confidence", "age")
 _MEASURED = ("distance_m", "distance_std_m", "speed_mps", "speed_std_mps")
 _MIN_DISTANCE = 1.0  # of a vehicle that moves on after its last detection (m)
 _MIN_SEARCH_RATE = 12.0  # searches per second of a video, at least
@@ -107,6 +107,7 @@ def _mean(first: Track, second: Track, dt: float, dt_after: float) -> Track:
     """Interpolate between two states of a track."""
     fraction = dt / (dt + dt_after)
     values: dict[str, Any] = {"box": _read_only(first.box + fraction * (second.box - first.box))}
+    values["time_since_update"] = first.time_since_update + dt  # as it was not searched for here
     for name in _INTERPOLATED + _MEASURED:
         a, b = getattr(first, name), getattr(second, name)
         if a is not None and b is not None:
@@ -117,7 +118,7 @@ def _mean(first: Track, second: Track, dt: float, dt_after: float) -> Track:
 def _move(track: Track, dt: float, shape: tuple[int, ...]) -> Track:
     """Move a track by `dt` seconds at its velocity and, where it is known, its speed."""
     box = track.box + dt * np.tile(track.velocity, 2)
-    values: dict[str, Any] = {"age": track.age + dt}
+    values: dict[str, Any] = {"age": track.age + dt, "time_since_update": track.time_since_update + abs(dt)}
     if track.distance_m is not None and track.speed_mps is not None:
         distance = max(track.distance_m + dt * track.speed_mps, _MIN_DISTANCE)
         center, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) / 2 * track.distance_m / distance
