@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import importlib.resources
+import json
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vehicle_detection.scenes.raster import Color, Doubles, Floats, blend, tile_to, wrapped_noise
+from vehicle_detection.scenes.raster import Doubles, Floats, blend, tile_to, wrapped_noise
 from vehicle_detection.scenes.shapes import BodyShape, profile_at
 
 PIXELS_PER_METER = 112
+_FILE = importlib.resources.files("vehicle_detection.scenes") / "vehicle_paint.json"
+_LAYERS: dict[str, list[dict[str, Any]]] = json.loads(_FILE.read_bytes())
+# A term of a length such as "0.5*belt-0.2".
+_TERM = re.compile(r"([+-]?)(?:([\d.]+)\*?)?([a-z_]*)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +92,6 @@ class SurfaceCanvas:
             values = cv2.GaussianBlur(values, (0, 0), soften * PIXELS_PER_METER)  # type: ignore[assignment]
         return Mask(np.asarray(values, np.float32), (slice(y1, y2), slice(x1, x2)), self.size)
 
-    def between(self, left: Doubles, right: Doubles, y: Doubles, *, soften: float = 0.0) -> Mask:
-        """Mask of the area between two curves, given by their `x` at ascending heights `y`."""
-        outline = np.column_stack([np.append(left, right[::-1]), np.append(y, y[::-1])])
-        return self.polygon(outline, soften=soften)
-
     def box(self, x: float, y: float, width: float, height: float, *, radius: float = 0.0) -> Mask:
         """Mask of a box centered at ``(x, y)`` with rounded corners."""
         w, h = width / 2, height / 2
@@ -133,48 +137,105 @@ def round_corners(corners: ArrayLike, radius: float) -> Doubles:
 
 
 class BodyPainter:
-    """Paints the details of one end or flank of a vehicle on a canvas in the body color."""
+    """Paints the layers of one end or flank of a vehicle (``vehicle_paint.json``) on a canvas in its color.
+
+    What the shape of a layer covers is multiplied by a ``gain``, becomes a ``lamp`` or ``glass``, or is
+    painted in a ``color``, ``lit`` by a factor. Lengths (m) may be sums of named ones, and a layer may depend
+    on details of the vehicle (``if``).
+    """
 
     def __init__(self, body: BodyShape, canvas: SurfaceCanvas, reflection: Floats) -> None:
         self.body, self.canvas = body, canvas
         self.reflection = reflection  # (H, W, 3) color of the surroundings in a mirror
-        self.dims, self.look, self.light = body.dimensions, body.appearance, body.light
+        dims, look, light = body.dimensions, body.appearance, body.light
+        self.dims, self.look, self.lamps = dims, look, light.lamps
+        lengths = ("clearance", "belt", "height", "width", "length")
+        self.names = {"": 1.0, "lamps": light.lamps} | {name: getattr(dims, name) for name in lengths}
+        self.flags = vars(look) | {"is_box": dims.is_box, "shining": light.lamps > 0.3}
+        bright = light.ambient + 0.4 * light.sun
+        gains = {  # at night and by day
+            "dark": (0.5, 1.0), "metal": (0.3, 0.9), "plastic": (0.35, light.ambient / 0.6),
+            "reverse": (0.4, 0.9), "lamp": (0.45, bright), "cargo": (0.4, bright), "pillar": (0.12, 0.4),
+            "plate": (max(0.5, light.lamps * 0.7), min(1.1, bright + 0.2 * light.sun)),
+            "flank": (0.35, light.ambient / 0.65), "cabin": (0.3, 1.0),
+        }  # fmt: skip
+        self.gains = {name: night if light.dark else day for name, (night, day) in gains.items()}
+        self.gains["side_lamp"] = max(self.gains["flank"], light.lamps)
+        rise = (canvas.y - 1.0) / (dims.height - 1.0)
+        self.colors: dict[str, ArrayLike] = {
+            "body": body.color,
+            "reflection": reflection,
+            "roof": reflection * 0.5 + body.color * 0.55 * self.gains["cabin"],
+            "cargo": look.cargo_color,
+            "doors": np.array(look.cargo_color) * (1.03 - 0.1 * rise)[..., None],
+            "side_lamp": (160, 24, 26) if body.view == "rear" else (190, 194, 198),
+            "plate": look.plate_color,
+        }
 
-    def by_light(self, night: float, day: float) -> float:
-        """Choose a value for night or day."""
-        return night if self.light.dark else day
+    def paint(self, part: str) -> None:
+        """Paint the layers of a part."""
+        for layer in _LAYERS[part]:
+            if all(bool(self.flags[name.lstrip("!")]) == (name[0] != "!") for name in layer.get("if", ())):
+                self._paint_layer(layer)
 
-    def band(self, low: float, high: float, ratio: float, inset: float = 0.0, *, soften: float = 0.0) -> Mask:
-        """Mask of a band across the body, `ratio` of its width less `inset` meters at each side."""
-        y = np.linspace(low, high, 12)
+    def _paint_layer(self, layer: dict[str, Any]) -> None:
+        canvas, color, lit = self.canvas, layer.get("color"), layer.get("lit", 1.0)
+        opacity = self._measure(layer.get("opacity", 1.0))
+        for outline in self._outlines(layer):
+            mask = canvas.polygon(outline, soften=layer.get("soften", 0.0))
+            if "minus" in layer:
+                mask = mask - canvas.polygon(self._band(layer["minus"]))
+            if "glass" in layer:
+                self.paint_glass(outline, seats=(-0.36, 0.36))
+            elif "lamp" in layer:
+                self._paint_lamp(outline, np.array(color))
+            elif "gain" in layer:
+                canvas.multiply(mask, layer["gain"])
+            else:
+                paint = np.asarray(self.colors[color] if isinstance(color, str) else color, np.float32)
+                canvas.paint(mask, paint * self.gains.get(lit, lit), opacity)
+
+    def _measure(self, value: Any) -> Any:
+        """Numbers for lengths such as 0.2 or ``"0.5*belt-0.2"``, or for lists of them."""
+        if isinstance(value, list):
+            return [self._measure(each) for each in value]
+        terms = _TERM.findall(value) if isinstance(value, str) else [("", value, "")]
+        return sum(
+            float(f"{sign}{factor or 1}") * self.names[name] for sign, factor, name in terms if factor or name
+        )
+
+    def _outlines(self, layer: dict[str, Any]) -> list[Doubles]:
+        """Outlines of a layer's shape: boxes at each `x`, a band, or a polygon and its mirror image."""
+        if "box" in layer:
+            x, y, width, height = self._measure(layer["box"])
+            corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (width / 2, height / 2)
+            outlines = [np.add(corners, (middle, y)) for middle in np.atleast_1d(x)]
+        elif "band" in layer:
+            outlines = [self._band(layer["band"], layer.get("steps", 12))]
+        else:
+            points = np.array(self._measure(layer["polygon"]))
+            outlines = [points * (side, 1) for side in ((-1, 1) if "mirrored" in layer else (1,))]
+        return [round_corners(outline, layer.get("radius", 0.0)) for outline in outlines]
+
+    def _band(self, band: list[Any], steps: int = 12) -> Doubles:
+        """Outline of a band across the body, a ratio of its width less some meters at each side."""
+        low, high, ratio, inset = self._measure(band)
+        y = np.linspace(low, high, steps)
         x = self.body.half_width(y) * ratio - inset
-        return self.canvas.between(x, -x, y, soften=soften)
+        return np.column_stack([np.append(-x, x[::-1]), np.append(y, y[::-1])])
 
-    def paint_box(
-        self, x: float, y: float, width: float, height: float, color: ArrayLike, opacity: float,
-        radius: float = 0.0,
-    ) -> None:  # fmt: skip
-        """Paint a box centered at ``(x, y)``."""
-        self.canvas.paint(self.canvas.box(x, y, width, height, radius=radius), color, opacity)
-
-    def paint_window(self, low: float, high: float, ratio: float, inset: float, radius: float) -> Mask:
-        """Paint a window across the body."""
-        bottom, top = (float(self.body.half_width(y)) * ratio - inset for y in (low, high))
-        corners = [(-bottom, low), (bottom, low), (top, high), (-top, high)]
-        return self.paint_glass(round_corners(corners, radius), seats=True)
-
-    def paint_glass(self, outline: Doubles, *, seats: bool) -> Mask:
+    def paint_glass(self, outline: Doubles, *, seats: Sequence[float] = ()) -> Mask:
         """Paint a pane: a dark cabin behind it, the reflected sky on it, a dark seal around it."""
         canvas, look = self.canvas, self.look
-        gain = self.by_light(0.3, 1.0)
+        gain = self.gains["cabin"]
         low, high = float(outline[:, 1].min()), float(outline[:, 1].max())
         rise = np.clip((canvas.y - low) / (high - low), 0, 1)
         canvas.paint(canvas.polygon(outline, soften=0.012), (18, 18, 20), 0.75)
         pane = canvas.polygon(outline)
-        cabin = np.array([34, 38, 42], np.float32) * (gain * look.glass_tint * self.light.ambient / 0.6)
+        cabin = np.array([34, 38, 42], np.float32) * (gain * look.glass_tint * self.body.light.ambient / 0.6)
         canvas.paint(pane, cabin * (0.8 + 0.5 * rise)[..., None])
-        for side in (-1, 1) if seats else ():
-            seat = canvas.box(side * 0.36, low + 0.1, 0.26, 0.34, radius=0.1)
+        for x in seats:
+            seat = canvas.box(x, low + 0.1, 0.26, 0.34, radius=0.1)
             canvas.paint(seat & pane, np.array([22, 24, 26]) * gain, 0.55)
         ripple = 0.75 + 0.25 * np.sin(canvas.x * 5.0 + look.seed % 7) * np.cos(canvas.y * 9.0 + look.seed % 5)
         strength = (0.16 + 0.42 * look.glass_reflection) * (0.45 + 0.55 * rise) * ripple
@@ -182,210 +243,93 @@ class BodyPainter:
         color += strength[..., None] * (self.reflection[pane.region] - 0.4 * color)
         return pane
 
-    def paint_plate(self, y: float) -> None:
-        """Paint a license plate with its recess."""
-        light, look = self.light, self.look
-        gain = self.by_light(max(0.5, light.lamps * 0.7), min(1.1, light.ambient + 0.6 * light.sun))
-        self.paint_box(0, y, 0.6, 0.185, self.body.color * 0.35, 0.55, radius=0.03)
-        self.paint_box(0, y, 0.52, 0.115, np.array(look.plate_color) * gain, 1.0)
-        rng = np.random.default_rng(look.seed)
-        for x in np.linspace(-0.2, 0.2, 8):
-            if rng.random() < 0.85:
-                self.paint_box(x, y, rng.uniform(0.02, 0.045), 0.066, (40, 42, 48), 0.8)
-
-    def paint_lamp(self, outline: Doubles, color: Color) -> None:
+    def _paint_lamp(self, outline: Doubles, color: Doubles) -> None:
         """Paint a lamp: its glass, darker at the rim, and its light."""
-        canvas, lamps = self.canvas, self.light.lamps
-        mask = canvas.polygon(outline)
-        gain = self.by_light(0.45, self.light.ambient + 0.4 * self.light.sun)
+        canvas, gain = self.canvas, self.gains["lamp"]
+        mask, middle = canvas.polygon(outline), outline.mean(0)
         canvas.paint(canvas.polygon(outline, soften=0.012), (26, 16, 16), 0.55)
-        canvas.paint(mask, np.array(color) * gain)
-        core = canvas.polygon(outline.mean(0) + (outline - outline.mean(0)) * 0.55, soften=0.02)
-        canvas.paint(core, np.minimum(np.array(color) * 1.25 + 38, 255) * max(gain, lamps), 0.55)
-        if lamps:
-            canvas.paint(mask, np.minimum(np.array(color) * 1.3 + 60, 255), 0.75 * lamps)
+        canvas.paint(mask, color * gain)
+        core = canvas.polygon(middle + (outline - middle) * 0.55, soften=0.02)
+        canvas.paint(core, np.minimum(color * 1.25 + 38, 255) * max(gain, self.lamps), 0.55)
+        if self.lamps:
+            canvas.paint(mask, np.minimum(color * 1.3 + 60, 255), 0.75 * self.lamps)
 
-    def paint_rear(self) -> None:
-        """Paint the rear of a car: bumper, tailgate or trunk lid, window, tail lamps, plate."""
-        canvas, dims, look, light = self.canvas, self.dims, self.look, self.light
-        sedan = dims.rear[-1][1] > 1.5
-        bumper_top = dims.clearance + 0.42
-        # The bumper has a crease at its top and a dark lower edge.
-        if look.plastic_bumper:
-            plastic = np.array([46, 47, 49]) * self.by_light(0.35, light.ambient / 0.6)
-            canvas.paint(self.band(dims.clearance, bumper_top - 0.04, 1.2), plastic, 0.9)
-        canvas.multiply(self.band(bumper_top - 0.012, bumper_top + 0.012, 0.99), 0.35)
-        canvas.multiply(self.band(bumper_top - 0.1, bumper_top - 0.075, 0.96), 1.22)
-        lower_edge = self.band(dims.clearance - 0.02, dims.clearance + 0.09, 0.82, soften=0.02)
-        canvas.paint(lower_edge, (24, 24, 26), 0.9)
-        for side in (-1, 1):
-            self.paint_box(side * 0.62, dims.clearance + 0.16, 0.16, 0.035, (120, 20, 20), 0.8, radius=0.01)
-        if look.exhaust:
-            self.paint_box(-0.5, dims.clearance + 0.02, 0.11, 0.05, (150, 150, 150), 0.7, radius=0.02)
-        # Gaps around the tailgate and a crease under the window.
-        low = dims.belt + (0.11 if sedan else 0.03)
-        high = dims.height - (0.075 if sedan else 0.11)
-        gate = self.band(bumper_top, dims.belt + (0.02 if sedan else 0.0), 0.8, 0.03)
-        canvas.multiply(gate - self.band(bumper_top + 0.012, dims.belt - 0.012, 0.8, 0.042), 0.5)
-        canvas.multiply(self.band(dims.belt - 0.2, dims.belt - 0.18, 0.8, 0.05), 0.78)
-        if sedan:
-            # The trunk lid reflects the sky.
-            lid = self.band(dims.belt + 0.025, dims.belt + 0.085, 0.93, 0.02, soften=0.01)
-            canvas.paint(lid, self.reflection, 0.3)
-            edge = self.band(dims.belt - 0.06, dims.belt - 0.005, 0.9, 0.02, soften=0.01)
-            canvas.multiply(edge, 1.12)
-        if not look.windowless:
-            self.paint_window(low, high, 0.86 if sedan else 0.93, 0.0 if sedan else 0.035, 0.1)
-            if not sedan:
-                self.paint_box(-0.12, low + 0.03, 0.42, 0.018, (14, 14, 14), 0.8)
-        if look.rear_doors:
-            middle, length = (dims.clearance + dims.height) / 2 + 0.1, dims.height - dims.clearance - 0.4
-            self.paint_box(0, middle, 0.05, length, self.body.color * 0.6, 0.9)
-            canvas.multiply(canvas.box(0, middle, 0.014, length), 0.3)
-        roof = self.band(high + 0.035, dims.height - 0.015, 0.86, 0.04, soften=0.008)
-        canvas.paint(roof, self.reflection * 0.5 + self.body.color * 0.55 * self.by_light(0.3, 1), 0.35)
-        self.paint_box(0, high + 0.02, 0.34, 0.022, (110, 20, 20), 0.8)
-        self._paint_tail_lamps(bumper_top, low)
-        metal = self.by_light(0.3, 0.9)
-        if look.chrome:
-            self.paint_box(0, dims.belt - 0.15, 0.56, 0.028, np.array((196, 198, 200)) * metal, 0.8)
-        self.paint_plate(dims.belt - 0.24 if look.plate_high else dims.clearance + 0.24)
-        self.paint_box(0, dims.belt - 0.09, 0.07, 0.07, np.array((190, 192, 196)) * metal, 0.8, radius=0.035)
-
-    def _paint_tail_lamps(self, bumper_top: float, window_low: float) -> None:
-        look, half_width = self.look, self.body.half_width
-        rng = np.random.default_rng(look.seed + 1)
-        if not look.tall_lamps:
-            top = self.dims.belt - 0.05
-        elif self.dims.height > 1.5 or rng.random() < 0.4:
-            top = window_low + rng.uniform(-0.05, 0.3)
+    def paint_end(self) -> None:
+        """Paint the near end."""
+        dims, look = self.dims, self.look
+        self.canvas.make_opaque(self.canvas.polygon(self._band(["clearance", "height", 0.975, 0.0], 60)))
+        if self.body.view == "front":
+            heights = np.linspace(0.6, dims.belt, 40)
+            nose = float(np.interp(0.22, profile_at(dims.front, heights), heights))
+            front_heights, front_depths = zip(*dims.front)
+            low = float(np.interp(0.1 if dims.is_box else 1.05, front_depths, front_heights))
+            self.names |= {"nose": nose, "low": min(max(low, dims.belt), dims.height - 0.5)}
+            self.names |= {"high": 2.4 if dims.is_box else dims.height - 0.1}
+            self.names |= {"outer": float(self.body.half_width(nose - 0.02)) * 0.97}
+            self.names |= {
+                "grille": nose - 0.06 - look.grille_height / 2,
+                "grille_height": look.grille_height,
+            }
+            part, plate = "front", dims.clearance + 0.27
+        elif dims.is_box:
+            part, plate = "box rear", 0.8
         else:
-            top = window_low - 0.02
-        low = max(top - look.lamp_height, bumper_top - 0.03)
-        lean = rng.uniform(0.0, 0.05)
-        outer_low, outer_top = (float(half_width(y)) * 0.985 for y in (low, top))
+            self._place_rear()
+            part, plate = "rear", dims.belt - 0.24 if look.plate_high else dims.clearance + 0.24
+        self.names["plate"] = plate
+        self.paint(part)
+        self.paint("plate")
+
+    def _place_rear(self) -> None:
+        """Name the lengths of the rear of a car: bumper, gap of the tailgate, window and tail lamps."""
+        dims, look, half_width = self.dims, self.look, self.body.half_width
+        sedan = dims.rear[-1][1] > 1.5
+        self.flags["sedan"] = sedan
+        bumper, low, top = dims.clearance + 0.42, dims.belt + (0.11 if sedan else 0.03), dims.belt - 0.05
+        self.names |= {"bumper": bumper, "gate": dims.belt + (0.02 if sedan else 0.0)}
+        self.names |= {"low": low, "high": dims.height - (0.075 if sedan else 0.11)}
+        rng = np.random.default_rng(look.seed + 1)
+        if look.tall_lamps:
+            high = dims.height > 1.5 or rng.random() < 0.4
+            top = low + (rng.uniform(-0.05, 0.3) if high else -0.02)
+        bottom, lean = max(top - look.lamp_height, bumper - 0.03), rng.uniform(0.0, 0.05)
+        outer_low, outer_top = (float(half_width(y)) * 0.985 for y in (bottom, top))
         inner_low, inner_top = outer_low - look.lamp_width - lean, outer_top - look.lamp_width + lean
-        corners = np.array([(outer_low, low), (outer_top, top), (inner_top, top), (inner_low, low)])
-        reverse_light = np.array((226, 206, 200)) * self.by_light(0.4, 0.9)
-        for side in (-1, 1):
-            outline = round_corners(corners * (side, 1), 0.05)
-            self.paint_lamp(outline, (136, 20, 24))
-            x, y = outline.mean(0)
-            if look.tall_lamps:
-                lens = (x, low + 0.3 * look.lamp_height, look.lamp_width * 0.6, 0.055)
-            else:
-                lens = (x - side * 0.3 * look.lamp_width, y, 0.07, look.lamp_height * 0.5)
-            self.paint_box(*lens, reverse_light, 0.65, radius=0.02)
-
-    def paint_front(self) -> None:
-        """Paint the front of a vehicle: windshield, hood, headlamps, grille, bumper, plate."""
-        canvas, dims, look, light = self.canvas, self.dims, self.look, self.light
-        heights = np.linspace(0.6, dims.belt, 40)
-        nose = float(np.interp(0.22, profile_at(dims.front, heights), heights))
-        front_heights, front_depths = zip(*dims.front)
-        low = float(np.interp(0.1 if dims.is_box else 1.05, front_depths, front_heights))
-        low = min(max(low, dims.belt), dims.height - 0.5)
-        high = 2.4 if dims.is_box else dims.height - 0.1
-        pane = self.paint_window(low, high, 0.92, 0.02, 0.09)
-        mirror = canvas.box(0, high - 0.07, 0.2, 0.06, radius=0.03)
-        canvas.paint(mirror & pane, (20, 22, 24), 0.9)
-        # The gap at the front edge of the hood.
-        canvas.multiply(self.band(nose - 0.01, nose + 0.008, 0.86, 0.05), 0.5)
-        dark = np.array([22, 22, 24]) * self.by_light(0.5, 1.0)
-        grille_y = nose - 0.06 - look.grille_height / 2
-        self.paint_box(0, grille_y, 0.72, look.grille_height, dark, 0.92, radius=0.04)
-        if look.chrome:
-            self.paint_box(0, grille_y, 0.7, 0.02, (190, 192, 196), 0.7)
-        self.paint_box(0, dims.clearance + 0.13, 1.05, 0.13, dark, 0.9, radius=0.05)
-        top = nose - 0.02
-        outer = float(self.body.half_width(top)) * 0.97
-        corners = np.array([(0, 0.03), (-0.4, -0.03), (-0.36, -0.17), (-0.02, -0.13)])
-        corners += (outer, top)
-        for side in (-1, 1):
-            self.paint_box(side * 0.66, dims.clearance + 0.14, 0.17, 0.1, dark, 0.7, radius=0.04)
-            outline = round_corners(corners * (side, 1), 0.05)
-            self.paint_lamp(outline, (186, 190, 196))
-            if light.lamps > 0.3:
-                x, y = outline.mean(0)
-                self.paint_box(x, y, 0.2, 0.15, (255, 252, 236), light.lamps, radius=0.07)
-        canvas.multiply(self.band(dims.clearance + 0.4, dims.clearance + 0.415, 0.98), 0.6)
-        self.paint_plate(dims.clearance + 0.27)
-        canvas.paint(self.band(dims.clearance - 0.02, dims.clearance + 0.05, 0.86, soften=0.02), dark, 0.9)
-
-    def paint_box_rear(self) -> None:
-        """Paint the rear of a box truck: cargo doors, lamps, underrun bar, plate."""
-        canvas, dims, light = self.canvas, self.dims, self.light
-        half, middle = dims.width / 2, (1 + dims.height) / 2
-        gain = self.by_light(0.4, light.ambient + 0.4 * light.sun)
-        doors = self.band(1.0, dims.height, 1.0)
-        shade = 1.03 - 0.1 * (canvas.y - 1.0) / (dims.height - 1.0)
-        canvas.paint(doors, np.array(self.look.cargo_color) * gain * shade[..., None])
-        frame = doors - self.band(1.06, dims.height - 0.07, 1.0, 0.07)
-        canvas.paint(frame, np.array([150, 150, 152]) * gain, 0.8)
-        canvas.multiply(canvas.box(0, middle, 0.025, dims.height - 1.1), 0.35)
-        for x in (-0.75, -0.3, 0.3, 0.75):
-            canvas.multiply(canvas.box(x, middle, 0.03, dims.height - 1.15), 0.72)
-            self.paint_box(x, 1.6, 0.09, 0.06, np.array([90, 90, 92]) * gain, 0.8)
-        canvas.paint(self.band(dims.clearance, 1.0, 1.0), np.array([30, 30, 32]) * self.by_light(0.5, 1))
-        self.paint_box(0, 0.55, dims.width * 0.92, 0.12, np.array([120, 120, 120]) * gain, 0.8)
-        for side in (-1, 1):
-            outer, inner = side * (half - 0.1), side * (half - 0.5)
-            outline = round_corners([(outer, 0.78), (outer, 0.94), (inner, 0.94), (inner, 0.78)], 0.03)
-            self.paint_lamp(outline, (176, 24, 26))
-        self.paint_plate(0.8)
+        self.names |= {"lamp_low": bottom, "lamp_top": top, "outer_low": outer_low, "outer_top": outer_top}
+        self.names |= {"inner_low": inner_low, "inner_top": inner_top}
+        lens = (outer_low + outer_top + inner_low + inner_top) / 4, (bottom + top) / 2
+        lens += (0.07, look.lamp_height * 0.5)
+        if look.tall_lamps:
+            lens = lens[0], bottom + 0.3 * look.lamp_height, look.lamp_width * 0.6, 0.055
+        else:
+            lens = lens[0] - 0.3 * look.lamp_width, *lens[1:]
+        self.names |= zip(("lens", "lens_y", "lens_width", "lens_height"), lens)
 
     def paint_flank(self) -> None:
         """Paint a flank: outline, windows with pillars, wheels in their arches, doors, sill."""
-        canvas, dims, look, light, body = self.canvas, self.dims, self.look, self.light, self.body
-        y = np.linspace(dims.clearance, dims.height, 50)
-        near, far = profile_at(body.end, y) - 0.06, dims.length - profile_at(body.far_end, y)
-        canvas.make_opaque(canvas.between(near, far, y))
-        dark = np.array([20, 20, 21]) * self.by_light(0.5, 1.0)
-        if dims.is_box:
-            start, stop = (1.6, dims.length) if body.view == "front" else (0.0, dims.length - 1.7)
-            cargo = self._rectangle(start, stop, 1.0, dims.height)
-            gain = self.by_light(0.4, light.ambient + 0.3 * light.sun)
-            canvas.paint(cargo, np.array(look.cargo_color) * gain)
-            canvas.paint(self._rectangle(0, dims.length, 0, 1.0), dark * 1.6, 0.85)
-        low, high = dims.belt + 0.02, dims.height - 0.09
-        self._paint_side_windows(low, high)
-        crease = [(0.1, -0.18), (dims.length - 0.2, -0.2), (dims.length - 0.2, -0.215), (0.1, -0.195)]
-        canvas.multiply(canvas.polygon([(x, dims.belt + y) for x, y in crease]), 0.75)
-        sill = self._rectangle(0, dims.length, dims.clearance - 0.05, dims.clearance + 0.1)
-        canvas.paint(sill, dark * 1.3, 0.75)
-        gain = self.by_light(0.35, light.ambient / 0.65)
-        if not dims.is_box:
-            lamp = np.array([(-0.02, -0.28), (0.2, -0.26), (0.16, -0.1), (-0.02, -0.08)])
-            lamp[:, 1] += dims.belt
-            color = np.array((160, 24, 26) if body.view == "rear" else (190, 194, 198))
-            canvas.paint(canvas.polygon(round_corners(lamp, 0.03)), color * max(gain, light.lamps), 0.9)
-        self._paint_wheels(dark, gain)
-
-    def _rectangle(self, x1: float, x2: float, y1: float, y2: float) -> Mask:
-        return self.canvas.polygon([(x1, y1), (x2, y1), (x2, y2), (x1, y2)])
-
-    def _paint_side_windows(self, low: float, high: float) -> None:
-        """Paint windows, pillars, door gaps and door handles."""
         canvas, dims, body = self.canvas, self.dims, self.body
-        first, last = dims.windows
+        ends = [
+            profile_at(end, np.linspace(dims.clearance, dims.height, 50)) for end in (body.end, body.far_end)
+        ]
+        y = np.linspace(dims.clearance, dims.height, 50)
+        outline = np.append(ends[0] - 0.06, dims.length - ends[1][::-1])
+        canvas.make_opaque(canvas.polygon(np.column_stack([outline, np.append(y, y[::-1])])))
+        (first, last), y = dims.windows, np.array([dims.belt + 0.02, dims.height - 0.09])
+        cargo = 0.0, dims.length - 1.7
         if body.view == "front":
-            first, last = dims.length - last, dims.length - first
-        y = np.array([low, high])
+            first, last, cargo = dims.length - last, dims.length - first, (1.6, dims.length)
         near = np.maximum(profile_at(body.end, y) + 0.1, first)
         far = np.minimum(dims.length - profile_at(body.far_end, y) - 0.1, last)
-        pane = np.array([(near[0], low), (far[0], low), (far[1], high), (near[1], high)])
-        canvas.multiply(self.paint_glass(round_corners(pane, 0.06), seats=False), 0.85)
-        if dims.is_box:
-            return
-        for position in (0.3, 0.62):
-            x = near[0] + (far[0] - near[0]) * position
-            self.paint_box(x, (low + high) / 2, 0.07, high - low, body.color * self.by_light(0.12, 0.4), 0.9)
-            gap = canvas.box(x, (dims.clearance + low) / 2 + 0.06, 0.014, low - dims.clearance - 0.12)
-            canvas.multiply(gap, 0.55)
-            self.paint_box(x + 0.2, dims.belt - 0.11, 0.17, 0.03, body.color * 0.7, 0.6)
+        pane = np.array([(near[0], y[0]), (far[0], y[0]), (far[1], y[1]), (near[1], y[1])])
+        canvas.multiply(self.paint_glass(round_corners(pane, 0.06)), 0.85)
+        pillars = near[0] + (far[0] - near[0]) * np.array([0.3, 0.62])
+        self.names |= zip(("cargo", "cargo_end", "pillar", "second_pillar"), (*cargo, *pillars))
+        self.paint("flank")
+        self._paint_wheels()
 
-    def _paint_wheels(self, dark: Doubles, gain: float) -> None:
+    def _paint_wheels(self) -> None:
         canvas, dims, body = self.canvas, self.dims, self.body
+        dark = np.array([20, 20, 21]) * self.gains["dark"]
         angles = np.linspace(0, 2 * np.pi, 40)
         circle = np.column_stack([np.cos(angles), np.sin(angles)])
         for hub in (body.overhang, dims.length - body.far_overhang):
@@ -395,7 +339,7 @@ class BodyPainter:
             canvas.make_opaque(tire)
             canvas.paint(tire, dark * 1.4)
             rim = canvas.polygon(center + circle * dims.wheel_radius * 0.64)
-            canvas.paint(rim, np.full(3, self.look.rim_tone * 0.85 * gain))
+            canvas.paint(rim, np.full(3, self.look.rim_tone * 0.85 * self.gains["flank"]))
             for angle in np.arange(5) * 2 * np.pi / 5 + self.look.seed % 3:
                 spoke = center + np.array([np.cos(angle), np.sin(angle)]) * dims.wheel_radius * 0.42
                 canvas.paint(canvas.polygon(spoke + circle * dims.wheel_radius * 0.13), dark, 0.85)
@@ -419,18 +363,9 @@ class VehicleBody(BodyShape):
         # The normal of z = depth(x, y) that faces the camera is (dz/dx, dz/dy, -1); rows run downwards.
         normal = np.stack([slope_x, -slope_y, -np.ones_like(slope_x)], axis=-1).astype(np.float32)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-        y = np.linspace(dims.clearance, dims.height, 60)
-        x = self.half_width(y) * 0.975
-        canvas.make_opaque(canvas.between(x, -x, y))
         reflection = self._reflect(normal)
         canvas.color[:] = self._shade(normal, reflection)
-        painter = BodyPainter(self, canvas, reflection)
-        if self.view == "front":
-            painter.paint_front()
-        elif dims.is_box:
-            painter.paint_box_rear()
-        else:
-            painter.paint_rear()
+        BodyPainter(self, canvas, reflection).paint_end()
         self._add_dirt(canvas)
         return canvas.surface(depth)
 

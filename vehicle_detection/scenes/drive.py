@@ -19,7 +19,7 @@ from vehicle_detection.scenes.raster import Rng
 from vehicle_detection.scenes.render import VehiclePose, VehicleTruth
 from vehicle_detection.scenes.scene import RandomState, Scene, SceneRenderer, make_generator
 from vehicle_detection.scenes.scenery import LANE, Road
-from vehicle_detection.scenes.shapes import random_appearance
+from vehicle_detection.scenes.shapes import KIND_WEIGHTS, random_appearance
 from vehicle_detection.tables import FrameKey, TrackTable
 
 SCENARIOS = (
@@ -76,59 +76,72 @@ class TrafficVehicle:
         return self.lane_from + (self.lane_to - self.lane_from) * t * t * (3 - 2 * t) + drift
 
 
+_CARS = ("hatchback", "estate", "sedan")
+# Vehicles of the scenarios with an event in the middle: values of a `TrafficVehicle`, or ranges of them.
+# `lanes` are those before and after a change, 1 beside the own one on the side of the event.
+_STAGED: dict[str, list[dict[str, Any]]] = {
+    "closing": [  # nearest after 4 s, at 9 to 18 m
+        {"start": (30.0, 36.0), "sway": (9.0, 10.5), "period": 8.0, "phase": math.pi / 2, "lanes": [0]},
+    ],
+    "cut_in": [
+        {"start": (14.0, 22.0), "speed": (0.0, 0.6), "sway": 0.3, "lanes": [1, 0], "change_for": (2.5, 4.0)},
+        {"start": 55.0, "sway": 0.8, "lanes": [-1]},
+    ],
+    "overtaking": [
+        {"start": (-3.0, -1.5), "lanes": [1], "kinds": (*_CARS, "mpv", "suv"),
+         "speed": lambda duration: min(max(45 / max(duration, 1.0), 5.0), 9.0)},
+        {"start": 70.0, "sway": 1.0, "lanes": [-1]},
+    ],
+    "crossing": [
+        {"start": 20.0, "sway": 0.6, "period": 9.0, "phase": (0, 6), "lanes": [1, -1], "kinds": _CARS},
+        {"start": 33.0, "sway": 0.8, "period": 11.0, "phase": (0, 6), "lanes": [0], "kinds": _CARS},
+    ],
+    "occlusion": [
+        {"start": 15.0, "sway": 0.6, "period": 9.0, "phase": (0, 6), "lanes": [1, -1], "change_for": 6.5,
+         "kinds": ("suv", "mpv", "van")},
+        {"start": 36.0, "sway": 0.8, "period": 11.0, "phase": (0, 6), "lanes": [0], "kinds": _CARS},
+    ],
+}  # fmt: skip
+
+
 def make_traffic(scenario: str, duration: float, rng: Rng) -> tuple[Road, list[TrafficVehicle]]:
     """Return road and vehicles of a scenario that lasts `duration` seconds; its event is in the middle."""
     road = Road(own=int(rng.integers(3)) if scenario in ("highway", "traffic", "empty") else 1)
     if scenario == "empty":
         return road, []
     if scenario in ("highway", "traffic"):
-        ahead = _vehicles_ahead(road, duration, rng)
-        if scenario == "traffic":
-            return road, ahead
-        return road, ahead + _oncoming_vehicles(road, duration, rng, first_track=len(ahead) + 1)
+        vehicles = _vehicles_ahead(road, rng, duration)
+        if scenario == "highway":
+            speed = -rng.uniform(48, 58)
+            for lane in (-1, -2):  # behind the barrier, visible from 220 m on
+                times = _times(rng, 220.0 / speed + rng.uniform(0, 1.5), duration, (1.0, 3.5))
+                look = {"lane_from": road.lane(lane), "view": "front", "oncoming": True}
+                vehicles += _one_by_one(times, 220.0, speed, rng, len(vehicles) + 1, **look)
+        return road, vehicles
     side = 1 if rng.random() < 0.5 else -1
     if scenario == "passing":
-        slow = _passing_vehicles(side * LANE, -rng.uniform(6.0, 10.0), duration, rng, first_track=1)
-        speed = rng.uniform(6.0, 10.0)
-        return road, slow + _passing_vehicles(-side * LANE, speed, duration, rng, first_track=len(slow) + 1)
-    if scenario == "closing":
-        near = TrafficVehicle(  # nearest after 4 s, at 9 to 18 m
-            track=1, start=rng.uniform(30.0, 36.0), sway=-rng.uniform(9.0, 10.5), period=8.0,
-            phase=-math.pi / 2, **random_appearance(rng),
-        )  # fmt: skip
-        return road, [near]
-    if scenario == "cut_in":
-        near = TrafficVehicle(
-            track=1, start=rng.uniform(14.0, 22.0), speed=rng.uniform(0.0, 0.6), sway=0.3,
-            lane_from=side * LANE, lane_to=0.0, change_at=duration / 2, change_for=rng.uniform(2.5, 4.0),
-            **random_appearance(rng),
-        )  # fmt: skip
-        far = TrafficVehicle(track=2, start=55.0, sway=0.8, lane_from=-side * LANE, **random_appearance(rng))
-        return road, [near, far]
-    if scenario == "overtaking":
-        near = TrafficVehicle(
-            track=1, start=rng.uniform(-3.0, -1.5), lane_from=side * LANE,
-            speed=min(max(45 / max(duration, 1.0), 5.0), 9.0),
-            **random_appearance(rng, ("hatchback", "estate", "sedan", "mpv", "suv")),
-        )  # fmt: skip
-        far = TrafficVehicle(track=2, start=70.0, sway=1.0, lane_from=-side * LANE, **random_appearance(rng))
-        return road, [near, far]
-    cars = ("hatchback", "estate", "sedan")
-    crossing = scenario == "crossing"
-    near_start, far_start, change_for = (20.0, 33.0, 5.0) if crossing else (15.0, 36.0, 6.5)
-    near = TrafficVehicle(
-        track=1, start=near_start, sway=0.6, period=9.0, phase=rng.uniform(0, 6),
-        lane_from=side * LANE, lane_to=-side * LANE, change_at=duration / 2, change_for=change_for,
-        **random_appearance(rng, cars if crossing else ("suv", "mpv", "van")),
-    )  # fmt: skip
-    far = TrafficVehicle(
-        track=2, start=far_start, sway=0.8, period=11.0, phase=rng.uniform(0, 6),
-        **random_appearance(rng, cars),
-    )  # fmt: skip
-    return road, [near, far]
+        vehicles = []
+        for sign in (-1, 1):  # one after the other, beside the camera during the drive
+            speed = sign * rng.uniform(6.0, 10.0)
+            times = _times(rng, rng.uniform(2.0, 3.0), duration - 2.0, (2.5, 4.0))
+            vehicles += _one_by_one(times, 0.0, speed, rng, len(vehicles) + 1, lane_from=-sign * side * LANE)
+        return road, vehicles
+    return road, [_stage(number, row, side, duration, rng) for number, row in enumerate(_STAGED[scenario], 1)]
 
 
-def _vehicles_ahead(road: Road, duration: float, rng: Rng) -> list[TrafficVehicle]:
+def _stage(track: int, row: dict[str, Any], side: int, duration: float, rng: Rng) -> TrafficVehicle:
+    """Return a vehicle of `_STAGED`; a lane change is in the middle of the drive."""
+    values = {}
+    for name, value in row.items():
+        if name not in ("lanes", "kinds"):
+            drawn = rng.uniform(*value) if isinstance(value, tuple) else value
+            values[name] = value(duration) if callable(value) else drawn
+    values |= zip(("lane_from", "lane_to"), (side * lane * LANE for lane in row["lanes"]))
+    look = random_appearance(rng, row.get("kinds", tuple(KIND_WEIGHTS)))
+    return TrafficVehicle(track=track, change_at=duration / 2, **values, **look)
+
+
+def _vehicles_ahead(road: Road, rng: Rng, duration: float) -> list[TrafficVehicle]:
     """Vehicles in every lane with gaps that their relative motion cannot close."""
     vehicles: list[TrafficVehicle] = []
     for lane in range(road.lanes):
@@ -144,36 +157,21 @@ def _vehicles_ahead(road: Road, duration: float, rng: Rng) -> list[TrafficVehicl
     return vehicles
 
 
-def _passing_vehicles(
-    lane: float, speed: float, duration: float, rng: Rng, first_track: int
+def _times(rng: Rng, first: float, end: float, step: tuple[float, float]) -> Iterator[float]:
+    """Yield times with random steps between them."""
+    while first < end:
+        yield first
+        first += rng.uniform(*step)
+
+
+def _one_by_one(
+    times: Iterable[float], place: float, speed: float, rng: Rng, first_track: int, **look: Any
 ) -> list[TrafficVehicle]:
-    """Vehicles of a lane, one after the other, that are beside the camera during the drive."""
-    vehicles: list[TrafficVehicle] = []
-    time = rng.uniform(2.0, 3.0)
-    while time < duration - 2.0:
-        vehicle = TrafficVehicle(
-            track=first_track + len(vehicles), start=-speed * time, speed=speed, lane_from=lane,
-            **random_appearance(rng),
-        )  # fmt: skip
-        vehicles.append(vehicle)
-        time += rng.uniform(2.5, 4.0)
-    return vehicles
-
-
-def _oncoming_vehicles(road: Road, duration: float, rng: Rng, first_track: int) -> list[TrafficVehicle]:
-    """Vehicles behind the barrier, one after the other in two lanes, visible from 220 m on."""
-    vehicles: list[TrafficVehicle] = []
-    visible_from, speed = 220.0, -rng.uniform(48, 58)
-    for lane in (-1, -2):
-        time = -visible_from / -speed + rng.uniform(0, 1.5)
-        while time < duration:
-            vehicle = TrafficVehicle(
-                track=first_track + len(vehicles), start=visible_from - speed * time, speed=speed,
-                lane_from=road.lane(lane), view="front", oncoming=True, **random_appearance(rng),
-            )  # fmt: skip
-            vehicles.append(vehicle)
-            time += rng.uniform(1.0, 3.5)
-    return vehicles
+    """Vehicles at the same speed, each at the distance `place` at its time."""
+    return [
+        TrafficVehicle(track=track, start=place - speed * time, speed=speed, **look, **random_appearance(rng))
+        for track, time in enumerate(times, first_track)
+    ]
 
 
 class Drive:
