@@ -29,7 +29,8 @@ from tests.helpers import ROOT
 from tests.video.clips import gray_frames, write_clip
 from vehicle_detection import detector
 from vehicle_detection._kernels.jit import jit
-from vehicle_detection.drive import event_files, events
+from vehicle_detection.drive import events
+from vehicle_detection.drive import outputs as event_files
 from vehicle_detection.images import write_image
 from vehicle_detection.scenes import render_scene
 

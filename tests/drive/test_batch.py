@@ -22,7 +22,7 @@ from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drive import batch_status, batch_summary
 from vehicle_detection.drive import batch_store as store
 from vehicle_detection.drive import batch_trip as trip_module
-from vehicle_detection.drive.batch_plan import list_videos, source_id
+from vehicle_detection.drive.batch_trip import list_videos, source_id
 from vehicle_detection.errors import InvalidInputError, OutputError, TransientVideoError, VideoError
 from vehicle_detection.formats import open_tracks
 

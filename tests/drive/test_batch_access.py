@@ -11,9 +11,9 @@ import pytest
 
 from tests.drive.batch_helpers import check_whole, counts, files, records, run
 from vehicle_detection import run_batch
-from vehicle_detection.drive import batch_plan as plan
+from vehicle_detection.drive import batch_trip as plan
 from vehicle_detection.drive import batch_trip as trip
-from vehicle_detection.drive.batch_plan import list_videos
+from vehicle_detection.drive.batch_trip import list_videos
 from vehicle_detection.errors import InvalidInputError, OutputError
 
 pytestmark = pytest.mark.usefixtures("private_scratch")

@@ -12,10 +12,10 @@ import pytest
 from tests.drive.batch_helpers import check_whole, counts, run
 from tests.drive.conftest import TRIPS
 from tests.drive.object_store import PORT, SITE, ObjectStore
-from vehicle_detection.drive import batch_plan as plan
 from vehicle_detection.drive import batch_status
-from vehicle_detection.drive.batch_plan import list_videos
+from vehicle_detection.drive import batch_trip as plan
 from vehicle_detection.drive.batch_store import open_store
+from vehicle_detection.drive.batch_trip import list_videos
 from vehicle_detection.errors import InvalidInputError, OutputError, TransientVideoError
 
 pytestmark = pytest.mark.usefixtures("private_scratch")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.drive.report_helpers import track
 from vehicle_detection import TrackTable
 from vehicle_detection.drive import OwnSpeed, own_speeds
-from vehicle_detection.drive.history import TrackHistory, bin_means, track_histories
+from vehicle_detection.drive.motion import TrackHistory, bin_means, track_histories
 
 PRESENCE = st.lists(st.sets(st.integers(1, 4)), max_size=40)
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from vehicle_detection.camera import Camera
-from vehicle_detection.drive.history import COLUMNS, TrackHistory
-from vehicle_detection.drive.motion import estimate_motion
+from vehicle_detection.drive.motion import COLUMNS, TrackHistory, estimate_motion
 
 SHAPE, FPS = (720, 1280), 25
 CAMERA = Camera.for_frame(SHAPE)

@@ -6,7 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from tests.drive.test_history import PRESENCE, table_of
-from vehicle_detection.drive.history import track_histories
+from vehicle_detection.drive.motion import track_histories
 from vehicle_detection.drive.report_charts import (
     Label,
     TimeAxis,

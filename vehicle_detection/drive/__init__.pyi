@@ -1,11 +1,10 @@
 from .batch import BatchReport, run_batch
 from .batch_store import BatchStatus, batch_status, batch_summary, with_source
 from .counts import COUNTED, MinuteCounts, VehicleCounts, count_vehicles
-from .event_files import EVENT_SUFFIXES, cut_clips, write_events
 from .events import EVENT_COLUMNS, KINDS, Event, find_events
+from .outputs import EVENT_SUFFIXES, SUBTITLE_SUFFIXES, cut_clips, write_events, write_subtitles
 from .own_speed import OwnSpeed, own_speeds, read_own_speed
 from .report import ReportWriter, TrackPicture, explain_tracks
-from .subtitles import SUBTITLE_SUFFIXES, write_subtitles
 from .trips import Trip, find_trips, open_trip, segment_clock
 from .worker_pool import open_dask
 

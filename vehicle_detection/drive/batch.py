@@ -27,17 +27,6 @@ from vehicle_detection._common import (
     pluralize,
     progress_bar,
 )
-from vehicle_detection.drive.batch_plan import (
-    Facts,
-    fingerprint_of,
-    group_files,
-    identity_of,
-    list_videos,
-    plan_trip,
-    shipped_model,
-    source_id,
-    trip_digest,
-)
 from vehicle_detection.drive.batch_store import (
     COUNTS,
     DONE,
@@ -53,9 +42,18 @@ from vehicle_detection.drive.batch_store import (
 from vehicle_detection.drive.batch_trip import (
     BUSY,
     RECORDED,
+    Facts,
+    fingerprint_of,
+    group_files,
+    identity_of,
+    list_videos,
     open_detector,
+    plan_trip,
     remove_replaced,
     run_trip,
+    shipped_model,
+    source_id,
+    trip_digest,
     warm_up,
 )
 from vehicle_detection.drive.trips import Trip, find_trips

@@ -13,8 +13,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import UNITS, Floats, Units, check, invalid
 from vehicle_detection.camera import Camera
-from vehicle_detection.drive.history import TrackHistory, split_runs, track_histories
-from vehicle_detection.drive.motion import LANE_HALF_WIDTH_M, Bools, Motion, estimate_motion
+from vehicle_detection.drive.motion import (
+    LANE_HALF_WIDTH_M,
+    Bools,
+    Motion,
+    TrackHistory,
+    estimate_motion,
+    split_runs,
+    track_histories,
+)
 from vehicle_detection.tables import TrackTable
 
 Kind = Literal[

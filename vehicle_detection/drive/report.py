@@ -41,7 +41,7 @@ from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import blur_boxes, color_index, draw_boxes, draw_cell_shares
 from vehicle_detection.drive.counts import count_vehicles
 from vehicle_detection.drive.events import KINDS, Event, check_events, find_events
-from vehicle_detection.drive.history import TrackHistory, bin_means, track_histories
+from vehicle_detection.drive.motion import TrackHistory, bin_means, track_histories
 from vehicle_detection.drive.own_speed import own_speeds
 from vehicle_detection.drive.report_charts import (
     MAX_ROWS,

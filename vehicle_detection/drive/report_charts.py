@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import Floats
-from vehicle_detection.drive.history import TrackHistory, bin_means, split_runs
+from vehicle_detection.drive.motion import TrackHistory, bin_means, split_runs
 
 MAX_ROWS = 14
 """Largest number of tracks that get a row each; more tracks share rows."""

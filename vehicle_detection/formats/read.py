@@ -22,7 +22,7 @@ from vehicle_detection._common import Limit, check, check_regular_file, describe
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import DatasetError
-from vehicle_detection.formats.coco import json_reason, read_coco
+from vehicle_detection.formats.datasets import json_reason, read_coco, read_yolo
 from vehicle_detection.formats.rows import (
     FRAME_NUMBER,
     FileRows,
@@ -33,7 +33,6 @@ from vehicle_detection.formats.rows import (
     rows_of_records,
     warn_of_numbers,
 )
-from vehicle_detection.formats.yolo import read_yolo
 from vehicle_detection.tables import (
     BOX_COLUMNS,
     CORNERS,

@@ -29,7 +29,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.formats.coco import (
+from vehicle_detection.formats.datasets import (
     Truth,
     Write,
     open_coco,

@@ -5,9 +5,8 @@ A pinhole camera looks along a flat, straight road; vehicles are painted bodies 
 
 from vehicle_detection.scenes.camera_light import SceneView
 from vehicle_detection.scenes.drive import Drive, render_drive, truth_table, write_labels
-from vehicle_detection.scenes.patches import render_patches
 from vehicle_detection.scenes.render import VehicleTruth
-from vehicle_detection.scenes.scene import Scene, SceneVehicle, render_scene
+from vehicle_detection.scenes.scene import Scene, SceneVehicle, render_patches, render_scene
 
 __all__ = [
     "Drive",

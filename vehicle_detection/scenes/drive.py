@@ -13,13 +13,11 @@ from typing import Any
 import numpy as np
 
 from vehicle_detection._common import atomic_write, check
-from vehicle_detection.scenes.bodywork import VehicleBody
-from vehicle_detection.scenes.camera_light import SceneConfig, SceneView
-from vehicle_detection.scenes.raster import Rng
+from vehicle_detection.scenes.camera_light import Rng, SceneConfig, SceneView
 from vehicle_detection.scenes.render import VehiclePose, VehicleTruth
 from vehicle_detection.scenes.scene import RandomState, Scene, SceneRenderer, make_generator
 from vehicle_detection.scenes.scenery import LANE, Road
-from vehicle_detection.scenes.shapes import KIND_WEIGHTS, random_appearance
+from vehicle_detection.scenes.vehicles import KIND_WEIGHTS, VehicleBody, random_appearance
 from vehicle_detection.tables import FrameKey, TrackTable
 
 SCENARIOS = (

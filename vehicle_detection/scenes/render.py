@@ -11,11 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.scenes.bodywork import PIXELS_PER_METER, VehicleBody
-from vehicle_detection.scenes.camera_light import SceneConfig
-from vehicle_detection.scenes.raster import Doubles, Floats, Image, alpha_over
+from vehicle_detection.scenes.camera_light import Doubles, Floats, Image, SceneConfig, alpha_over
 from vehicle_detection.scenes.scenery import Canvas, Scenery, draw_layer
-from vehicle_detection.scenes.shapes import profile_at
+from vehicle_detection.scenes.vehicles import PIXELS_PER_METER, VehicleBody, profile_at
 
 NEAR_PLANE = 1.0  # distance from which on anything is drawn (m)
 _INVERSE = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

@@ -10,12 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection.scenes.camera_light import Light, SceneConfig
-from vehicle_detection.scenes.raster import (
+from vehicle_detection.scenes.camera_light import (
     Doubles,
     Floats,
     Image,
+    Light,
     Rng,
+    SceneConfig,
     alpha_over,
     blend,
     tile_to,
