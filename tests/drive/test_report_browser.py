@@ -3,6 +3,7 @@
 import itertools
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from vehicle_detection.annotator import Annotator
 from vehicle_detection.boxes import Detections
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.drive import ReportWriter
+from vehicle_detection.drive import OwnSpeed, ReportWriter
 from vehicle_detection.scenes import render_drive
 from vehicle_detection.tracking import FrameResult
 from vehicle_detection.video import process_video
@@ -157,6 +158,43 @@ def test_hovering_over_a_chart_shows_the_values_there(browser, embedded):
     browser.point(".bar[data-track='2']", 0.5)
     assert browser.run("[...document.querySelectorAll('.faded')].every(part => part.dataset.track === '1')")
     assert browser.run("document.querySelectorAll('.faded').length") == 3
+
+
+def test_charts_show_lines_bands_bars_and_labels(browser, tmp_path):
+    own = SimpleNamespace(annotator=Annotator(own_speed=OwnSpeed([0.0, 2.0], [10.0, 10.0])))
+    # Many vehicles at one distance; one is seen once, one with a gap.
+    frames = [[report_track(number, distance=38, speed=-12) for number in range(1, 8)] for _ in range(50)]
+    frames[20].append(report_track(8, distance=9, speed=None))
+    for index in (0, 1, 2, 4, 5):
+        frames[index].append(report_track(9, distance=20 + index, speed=2))
+    write_report(tmp_path, frames, detector=own)
+    browser.open(tmp_path / "report.html")
+    charts = "[...document.querySelectorAll('.plot[data-series]')]"
+    assert browser.run(f"{charts}.map(each => each.dataset.series)") == [
+        "count",
+        "distance",
+        "ground",
+        "speed",
+    ]
+    ticks = browser.run(
+        f"{charts}.map(each => [...each.closest('.graph').querySelectorAll('.values text')]"
+        ".map(text => +text.textContent.replace('\\u2212', '-')))"
+    )
+    assert ticks == [[0, 5, 10], [0, 10, 20, 30, 40], [-20, 0, 20, 40, 60], [-60, -40, -20, 0, 20]]
+    paths = browser.run(
+        f"{charts}.map(each => [...each.querySelectorAll('path')].map(path => path.getAttribute('d')))"
+    )
+    assert "NaN" not in str(paths)
+    assert [len(each) for each in paths] == [1, 18, 9, 8]  # with bands; the own speed; no speed of one
+    assert [path.count("h") for path in paths[1][-4:]] == [0, 0, 0, 1]  # a point is a short line
+    assert [path.count("M") for path in paths[1][-4:]] == [2, 2, 1, 1]  # band and line of each
+    places = browser.run(
+        "[...document.querySelector('[data-series=distance]').querySelectorAll('.track-name')]"
+        ".map(text => +text.getAttribute('y'))"
+    )
+    assert 2 <= len(places) <= 4  # of seven, those near their lines
+    assert all(abs(one - other) >= 13 - 1e-3 for one, other in itertools.combinations(places, 2))
+    assert browser.log("browser") == []
 
 
 def test_charts_zoom_and_scroll_together(browser, tmp_path):

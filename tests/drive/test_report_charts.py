@@ -1,37 +1,13 @@
 import math
-from itertools import combinations, pairwise
+from itertools import combinations
 
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.test_history import PRESENCE, table_of
 from vehicle_detection.drive.motion import track_histories
-from vehicle_detection.drive.report_charts import (
-    Label,
-    TimeAxis,
-    ValueAxis,
-    assign_rows,
-    format_time,
-    separate_labels,
-)
-
-
-@given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.booleans())
-def test_a_value_axis_covers_its_values_with_round_ticks(one, other, integers):
-    low, high = min(one, other), max(one, other)
-    assume(high - low > 1e-3)
-    axis = ValueAxis.covering(low, high, 100, integers=integers)
-    assert axis.low <= low + 1e-6 * (high - low)
-    assert axis.high >= high - 1e-6 * (high - low)
-    assert 2 <= len(axis.ticks) <= 7
-    assert axis.ticks[0] == axis.low
-    assert axis.ticks[-1] == axis.high
-    assert all(after > before for before, after in pairwise(axis.ticks))
-    assert axis.y(axis.low) == pytest.approx(100)
-    assert axis.y(axis.high) == 0
-    if integers:
-        assert all(tick == round(tick) for tick in axis.ticks)
+from vehicle_detection.drive.report_charts import TimeAxis, assign_rows, format_time
 
 
 @given(st.integers(1, 2_000_000), st.sampled_from([5.0, 25.0, 29.97, 60.0]))
@@ -42,20 +18,6 @@ def test_ticks_of_a_time_axis_lie_in_the_video(frames, fps):
     assert 1 <= len(ticks) <= 7
     assert ticks[-1] <= axis.seconds + 1e-9
     assert math.ceil(frames / axis.bin_width) <= 2000
-
-
-@given(st.lists(st.tuples(st.floats(0, 100), st.floats(-10, 160)), max_size=20))
-def test_labels_do_not_overlap(places):
-    labels = [Label(x, y, number) for number, (x, y) in enumerate(places)]
-    kept = separate_labels(labels, 150)
-    for one, other in combinations(kept, 2):
-        assert abs(one.x - other.x) >= 5 or abs(one.y - other.y) >= 13 - 1e-9
-    assert all(0 < label.y <= 150 for label in kept)
-    for label in kept:
-        x, y = places[label.track]
-        assert label.x == x
-        assert abs(label.y - min(max(y, 13), 148)) <= 1.5 * 13
-    assert len({label.track for label in kept}) == len(kept)
 
 
 @given(PRESENCE)

@@ -56,6 +56,81 @@ function showReadout(frame) {
   }));
 }
 
+// Charts of values: round ticks, lines of the tracks with bands of standard errors, labels at their ends.
+function draw(plot, parent, name, attributes, text = "") {
+  const made = document.createElementNS(plot.namespaceURI, name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  made.textContent = text;
+  parent.insertBefore(made, parent.querySelector(":scope > .cursor"));
+  return made;
+}
+function roundTicks(low, high, maxSteps, minStep) {
+  const extent = Math.max(high - low, 1e-6), power = 10 ** Math.floor(Math.log10(extent / maxSteps));
+  const step = Math.max([1, 2, 5, 10].map(n => n * power).find(n => n * maxSteps >= extent * .999), minStep);
+  const first = Math.floor(low / step + 1e-9), last = Math.max(Math.ceil(high / step - 1e-9), first + 1);
+  return Array.from({length: last - first + 1}, (_, n) => (first + n) * step);
+}
+// Start and end of each run of known values.
+function knownRuns(values) {
+  const starts = values.flatMap((value, n) => value != null && values[n - 1] == null ? [n] : []);
+  return starts.map(start => {
+    let stop = start;
+    while (values[stop] != null) stop++;
+    return [start, stop];
+  });
+}
+// Move labels up or down until none overlap; those that would be far from their lines are left out.
+function placeLabels(labels, height) {
+  const placed = [], size = 13;
+  for (const label of labels.sort((one, other) => one.y - other.y || one.x - other.x)) {
+    const start = Math.min(Math.max(label.y, size), height - 2);
+    const near = placed.filter(other => Math.abs(other.x - label.x) < 5).map(other => other.y);
+    const free = [start, ...near.flatMap(y => [y + size, y - size])].filter(y => Math.abs(y - start) <= 1.5 * size
+      && y >= size - 2 && y <= height - 2 && near.every(taken => Math.abs(y - taken) >= size - 1e-6));
+    free.sort((one, other) => Math.abs(one - start) - Math.abs(other - start));
+    if (free.length) placed.push({...label, y: free[0]});
+  }
+  return placed;
+}
+function drawChart(plot) {
+  const {series} = plot.dataset, height = Number(plot.dataset.height), bars = series === "count" ? data.counts : null;
+  const lines = bars ? [] : data.tracks.map(track => ({...track, values: track[series], stds: series === "distance" ? track.std : null}));
+  if (series === "ground") lines.push({values: data.own, first: 0, stds: null});
+  let [low, high] = [0, 0];
+  for (const value of bars ? bars.heights : lines.flatMap(({values, stds}) => values.map((each, n) => each + (each && stds && stds[n]))))
+    [low, high] = [Math.min(low, value), Math.max(high, value)];
+  const ticks = roundTicks(low, high, bars ? 3 : 4, bars ? 1 : 0), bottom = ticks[0], top = ticks[ticks.length - 1];
+  const y = value => ((top - value) / (top - bottom) * height).toFixed(2);
+  const x = frame => (Math.min(frame / data.frames, 1) * 1000).toFixed(2);
+  for (const tick of ticks) {
+    const text = String(+tick.toPrecision(6)).replace("-", "\u2212"), axis = plot.closest(".graph").querySelector(".values");
+    draw(plot, axis, "text", {x: "100%", dx: -6, y: +y(tick) + 4, "text-anchor": "end"}, text);
+    draw(plot, plot, "line", {class: tick === 0 && low < 0 ? "zero" : "grid", x1: 0, x2: "100%", y1: y(tick), y2: y(tick)});
+  }
+  const inner = draw(plot, plot, "svg", {viewBox: "0 0 1000 " + height, preserveAspectRatio: "none", width: "100%", height});
+  if (bars) draw(plot, inner, "path", {class: "count", d: bars.heights.map((value, n) =>
+    value ? `M${x(bars.edges[n])},${y(0)}V${y(value)}H${x(bars.edges[n + 1])}V${y(0)}Z` : "").join("")});
+  const labels = [];
+  for (const {id, color, first, values, stds} of lines) {
+    const runs = knownRuns(values), last = runs.length ? runs[runs.length - 1][1] - 1 : 0;
+    if (!runs.length) continue;
+    const middle = n => (first + n + .5) * data.step;
+    const points = ([start, stop], sign) => values.slice(start, stop).map((value, n) =>
+      x(middle(start + n)) + "," + y(value + (sign && sign * stds[start + n])));
+    // A single point gets a short line, as a line without length is invisible.
+    const path = runs.map(run => "M" + points(run, 0).join(" ")
+      + (run[1] - run[0] > 1 ? "" : "h" + Math.max(data.step / data.frames * 1000, 2))).join("");
+    const group = draw(plot, inner, "g", id ? {class: "curve c" + color, "data-track": id} : {class: "curve own"});
+    if (stds) draw(plot, group, "path", {class: "band", d: runs.map(run => "M" + [...points(run, 1), ...points(run, -1).reverse()].join(" ") + "Z").join("")});
+    draw(plot, group, "path", {class: "line", d: path});
+    if (id && (last - runs[0][0]) * data.step >= data.min_labeled * data.frames)
+      labels.push({x: Math.min(middle(last) / data.frames, 1) * 100, y: y(values[last]) - 4, id, color});
+  }
+  for (const {x, y, id, color} of placeLabels(labels, height))
+    draw(plot, plot, "text", {class: "track-name c" + color, x: x + "%", y, ...(x < 90 ? {dx: 4} : {dx: -4, "text-anchor": "end"})}, "#" + id);
+}
+document.querySelectorAll(".plot[data-series]").forEach(drawChart);
+
 // Zoomed charts are wider than their column and scroll together.
 const zoomBar = document.querySelector(".zoom"), scrolls = [...document.querySelectorAll(".scroll")];
 const length = data.frames / data.fps, maxZoom = 2 ** Math.floor(Math.log2(Math.max(length / 10, 1)));

@@ -46,17 +46,11 @@ from vehicle_detection.drive.own_speed import own_speeds
 from vehicle_detection.drive.report_charts import (
     MAX_ROWS,
     MIN_LABELED,
-    Label,
     TimeAxis,
-    ValueAxis,
     assign_rows,
-    count_path,
-    curve_paths,
     decimal,
-    end_labels,
     format_time,
     format_value,
-    separate_labels,
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import Explanation, explain
@@ -282,23 +276,14 @@ def _draw_explanation(
     return np.hstack([plain, shares])
 
 
-class Curve(NamedTuple):
-    """Paths of a chart by their class."""
-
-    paths: dict[str, str]
-    name: str = ""  # class of their group
-    track: int | None = None
-
-
 class Figure(NamedTuple):
-    """A chart of values over time with its caption; without values, the note is shown alone."""
+    """A chart of values over time with its caption; without a label, the note is shown alone."""
 
     title: str
     note: str
     label: str = ""  # describes it to those who do not see it
-    axis: ValueAxis | None = None
-    curves: Sequence[Curve] = ()
-    names: Sequence[Label] = ()
+    series: str = ""  # name of the values in the data of the script
+    height: int = 150
 
 
 def render_page(
@@ -323,6 +308,11 @@ def render_page(
     chosen = UNITS[units]
     own = None if own_speed_mps is None else own_speed_mps * chosen.speed
     tracks = [_for_page(track, chosen, own) for track in track_histories(table)]
+    bars, seconds = _count_bars(table, axis)
+    data = _script_data(tracks, axis, own)
+    data |= {"units": [chosen.distance_symbol, chosen.speed_symbol], "counts": bars}
+    quantities = ("distance", *["speed over ground"] * (own is not None), "relative speed")
+    figures = [_count_figure(bars, seconds), *(_curve_figure(each, data, chosen) for each in quantities)]
     folder, names = files("vehicle_detection.drive"), ("report.css", "report.js", "report.html.j2")
     css, script, template = (folder.joinpath(name).read_text(encoding="utf-8") for name in names)
     environment = Environment(
@@ -347,7 +337,7 @@ def render_page(
         rows=assign_rows(tracks, axis),
         share_rows=len(tracks) > MAX_ROWS,
         min_labeled=MIN_LABELED,
-        figures=_figures(tracks, table, axis, chosen, own) if tracks else [],
+        figures=figures if tracks else [],
         events=events,
         event_kinds={kind: name for kind, name in KINDS.items() if any(each.kind == kind for each in events)},
         pictures=pictures,
@@ -355,7 +345,7 @@ def render_page(
         settings=_settings(detector, report.shape),
         model=_model_summary(getattr(detector, "model", None)),
         version=vehicle_detection.__version__,
-        data=_script_data(tracks, axis, own) | {"units": [chosen.distance_symbol, chosen.speed_symbol]},
+        data=data,
     )
 
 
@@ -413,18 +403,15 @@ def _counts(
     return counts
 
 
-def _figures(
-    tracks: Sequence[TrackHistory], table: TrackTable, axis: TimeAxis, units: Units, own: Floats | None
-) -> list[Figure]:
-    return [
-        _count_figure(table, axis),
-        _curve_figure("distance", tracks, axis, units),
-        *([_curve_figure("speed over ground", tracks, axis, units, own)] if own is not None else []),
-        _curve_figure("relative speed", tracks, axis, units),
-    ]
+def _count_figure(counts: dict[str, list[float]], seconds: int) -> Figure:
+    interval = "each second" if seconds == 1 else f"each {seconds} seconds"
+    low, high = min(counts["heights"]), max(counts["heights"])
+    label = f"Bars: most vehicles at once in {interval}, from {low:g} to {high:g}."
+    return Figure("Vehicles", f"Most shown at once in {interval}", label, "count", 70)
 
 
-def _count_figure(table: TrackTable, axis: TimeAxis) -> Figure:
+def _count_bars(table: TrackTable, axis: TimeAxis) -> tuple[dict[str, list[float]], int]:
+    """Largest number of vehicles between edges (in frames), and the seconds between them."""
     counts = table.counts()
     fitting = (each for each in _COUNT_SECONDS if axis.seconds / each <= 300 and each * axis.fps >= 1)
     seconds = next(fitting, 600)
@@ -432,55 +419,32 @@ def _count_figure(table: TrackTable, axis: TimeAxis) -> Figure:
     while edges[-1] < axis.frames:  # a frame belongs to the second in which it begins
         edges.append(min(math.ceil(len(edges) * seconds * axis.fps - 1e-6), axis.frames))
     heights = [float(counts[int(start) : int(stop)].max(initial=0)) for start, stop in pairwise(edges)]
-    values = ValueAxis.covering(0, max(heights), 70, integers=True, max_steps=3)
-    interval = "each second" if seconds == 1 else f"each {seconds} seconds"
-    label = f"Bars: most vehicles at once in {interval}, from {min(heights):g} to {max(heights):g}."
-    bars = Curve({"count": count_path(heights, edges, axis, values)})
-    return Figure("Vehicles", f"Most shown at once in {interval}", label, values, [bars])
+    return {"edges": edges, "heights": heights}, seconds
 
 
-def _curve_figure(
-    quantity: str,
-    tracks: Sequence[TrackHistory],
-    axis: TimeAxis,
-    units: Units,
-    own: Floats | None = None,
-) -> Figure:
+def _curve_figure(quantity: str, data: dict[str, Any], units: Units) -> Figure:
     """Lines of the distance, the speed over ground or the relative speed of each track, and the own speed."""
     error = f"standard error at most {units.speed * MAX_SPEED_STD:.0f} {units.speed_symbol}"
-    column, std, symbol, note = {
+    series, symbol, note = {
         "distance": (
-            "distance_m", "distance_std_m", units.distance_name,
+            "distance", units.distance_name,
             f"{units.distance_name.capitalize()} along the road; the band is one standard error",
         ),
         "speed over ground": (
-            "ground_speed", None, units.speed_symbol,
+            "ground", units.speed_symbol,
             f"{units.speed_name.capitalize()}, below 0 for oncoming vehicles; dashed: the own speed",
         ),
         "relative speed": (
-            "speed_mps", None, units.speed_symbol,
+            "speed", units.speed_symbol,
             f"{units.speed_name.capitalize()} relative to the camera, above 0 when moving away; {error}",
         ),
     }[quantity]  # fmt: skip
-    series = [bin_means(track.frames, track.columns[column], axis.bin_width)[1] for track in tracks]
-    known = np.concatenate([*series, [] if own is None else own[np.isfinite(own)]])
-    if not known.size:
+    lines = [*(track[series] for track in data["tracks"]), data["own"] if series == "ground" else []]
+    known = [value for line in lines for value in line if value is not None]
+    if not known:
         return Figure(quantity.capitalize(), f"No {quantity} is known.")
-    low, high = float(known.min()), float(known.max())
-    # The band around a line belongs to it.
-    edges = [track.columns[column] + track.columns[std] for track in tracks] if std else []
-    top = max([high, *(float(np.nanmax(each)) for each in edges if np.isfinite(each).any())])
-    values = ValueAxis.covering(min(low, 0.0), max(top, 0.0), 150)
-    curves = []
-    for track in tracks:
-        stds = track.columns[std] if std else None
-        paths = curve_paths(track.frames, track.columns[column], axis, values, stds)
-        curves += [Curve(paths, f"curve c{track.color}", track.id)] if paths else []
-    if own is not None:
-        curves.append(Curve(curve_paths(np.arange(len(own)), own, axis, values), "curve own"))
-    label = f"Lines: {quantity} of each track, from {low:.0f} to {high:.0f} {symbol}."
-    names = separate_labels(end_labels(tracks, column, axis, values), values.height)
-    return Figure(quantity.capitalize(), note, label, values, curves, names)
+    label = f"Lines: {quantity} of each track, from {min(known):.0f} to {max(known):.0f} {symbol}."
+    return Figure(quantity.capitalize(), note, label, series)
 
 
 def _script_data(tracks: Sequence[TrackHistory], axis: TimeAxis, own: Floats | None) -> dict[str, Any]:
@@ -502,13 +466,16 @@ def _script_data(tracks: Sequence[TrackHistory], axis: TimeAxis, own: Floats | N
                 "spans": track.spans(),
                 "first": track.first // axis.bin_width,
                 "distance": means(track.frames, distances),
+                "std": means(track.frames, np.where(np.isfinite(distances), stds, np.nan)),
                 "speed": means(track.frames, track.columns["speed_mps"]),
                 "rough": [int((share or 0.0) > 0.5) for share in rough],
             }
+            | ({} if own is None else {"ground": means(track.frames, track.columns["ground_speed"])})
         )
     own_means = [] if own is None or not len(own) else means(np.arange(len(own)), own)
     return {
-        "fps": axis.fps, "frames": axis.frames, "step": axis.bin_width, "tracks": listed, "own": own_means
+        "fps": axis.fps, "frames": axis.frames, "step": axis.bin_width, "min_labeled": MIN_LABELED,
+        "tracks": listed, "own": own_means,
     }  # fmt: skip
 
 
