@@ -176,10 +176,10 @@ class Ground:
 
     def _make_parts(self, row_length: Doubles, texture: Floats) -> list[_TexturedPart]:
         """Choose for each row, which covers `row_length` meters of road, the mipmap level of that length."""
-        levels = [np.clip(texture * 128, 0, 255).astype(np.uint8)]
+        levels: list[Any] = [np.clip(texture * 128, 0, 255).astype(np.uint8)]
         while len(levels) < 7:
             size = (levels[-1].shape[1], levels[-1].shape[0] // 2)
-            levels.append(cv2.resize(levels[-1], size, interpolation=cv2.INTER_AREA))  # type: ignore[arg-type]
+            levels.append(cv2.resize(levels[-1], size, interpolation=cv2.INTER_AREA))
         parts = []
         for level, rows in _mipmap_parts(row_length / _TILE_ALONG, len(levels)):
             map_x = ((self._across[rows] + _TILE_HALF_WIDTH) / _TILE_ACROSS - 0.5).astype(np.float32)
@@ -353,25 +353,20 @@ def _draw_crown(rng: Rng, x: Floats, y: Floats, light: Light) -> tuple[Floats, F
 
 
 def _draw_sign(rng: Rng, light: Light) -> Floats:
-    """Paint a road sign on its post as ``(128, 64, 4)`` premultiplied RGBA, 0-255."""
+    """Paint a road sign with a pale bar on its post as ``(128, 64, 4)`` premultiplied RGBA, 0-255."""
     sign = np.zeros((128, 64, 4), np.float32)
-
-    def tone(color: tuple[int, int, int], reflection: float = 1.0) -> tuple[float, ...]:
-        return (*np.clip(light.shade(color) * (reflection if light.dark else 1), 0, 255).tolist(), 255.0)
-
-    pale = tone((226, 226, 222), 1.8)
-    cv2.rectangle(sign, (30, 40), (33, 127), tone((120, 122, 124)), -1)
-    face = tone([(24, 86, 60), (38, 70, 132), (206, 168, 40), (220, 220, 216)][int(rng.integers(4))], 1.8)
-    form = int(rng.integers(3))
-    if form == 0:
+    faces = [(24, 86, 60), (38, 70, 132), (206, 168, 40), (220, 220, 216), (190, 40, 40)]
+    gain = 1.8 if light.dark else 1.0
+    post, pale, face = (
+        (*np.clip(light.shade(color) * factor, 0, 255).tolist(), 255.0)
+        for color, factor in (((120, 122, 124), 1.0), ((226, 226, 222), gain), (faces[rng.integers(5)], gain))
+    )
+    cv2.rectangle(sign, (30, 40), (33, 127), post, -1)
+    if rng.random() < 0.5:
         cv2.rectangle(sign, (6, 6), (57, 48), face, -1, cv2.LINE_AA)
-        for y in (16, 26, 36):
-            cv2.line(sign, (13, y), (int(rng.integers(34, 51)), y), pale, 3)
-    elif form == 1:
-        cv2.fillPoly(sign, [np.array([(32, 2), (60, 30), (32, 58), (4, 30)])], face, cv2.LINE_AA)
     else:
-        cv2.circle(sign, (32, 30), 26, tone((190, 40, 40), 1.8), -1, cv2.LINE_AA)
-        cv2.circle(sign, (32, 30), 19, pale, -1, cv2.LINE_AA)
+        cv2.circle(sign, (32, 30), 26, face, -1, cv2.LINE_AA)
+    cv2.line(sign, (16, 29), (48, 29), pale, 4)
     return sign
 
 
@@ -479,25 +474,29 @@ class Scenery:
                 self._draw_line(canvas, x, float(start), float(start) + 3.6, self._white)
 
     def _draw_line(self, canvas: Canvas, x: float, start: float, stop: float, color: Doubles) -> None:
-        """Draw a line along the road in pieces, because haze and headlights change along it."""
+        """Draw a line along the road."""
         camera, light = self.config.camera, self.config.light
         nearest = camera.focal_px * camera.height_m / (self.config.shape[0] - camera.horizon_px) * 0.9
         first, last = max(start, nearest), min(stop, _MARKING_END)
-        if last - first < 0.05:
-            return
-        reflection = 1.6 if light.dark else 1.0
-        sides = [x - 0.075, x + 0.075, x + 0.075, x - 0.075]
-        for near, far in pairwise(np.geomspace(first, last, 2 + int(np.log2(last / first) * 2))):
-            corners = self.config.project(sides, 0.0, [near, near, far, far])
-            canvas.fill(corners, light.shade(color * reflection, float(np.sqrt(near * far))))
+        if last - first >= 0.05:
+            pieces = 2 + int(np.log2(last / first) * 2)
+            sides = ([x - 0.075, x + 0.075, x + 0.075, x - 0.075], 0.0)
+            self._draw_strip(canvas, sides, first, last, pieces, color * (1.6 if light.dark else 1.0))
 
     def _draw_wall(self, canvas: Canvas, x: float, low: float, high: float, color: ArrayLike) -> None:
-        """Draw an upright band along the road in pieces, because haze and headlights change along it."""
-        config = canvas.config
-        first = max(abs(x) / ((config.shape[1] / 2 + 40) / config.camera.focal_px), 1.2)
-        for near, far in pairwise(np.geomspace(first, max(_MARKING_END, 2 * first), 14)):
-            corners = config.project(x, [low, low, high, high], [near, far, far, near])
-            canvas.fill(corners, config.light.shade(color, float(np.sqrt(near * far))))
+        """Draw an upright band along the road."""
+        first = max(abs(x) / ((canvas.config.shape[1] / 2 + 40) / canvas.config.camera.focal_px), 1.2)
+        sides = (x, [low, high, high, low])
+        self._draw_strip(canvas, sides, first, max(_MARKING_END, 2 * first), 14, color)
+
+    @staticmethod
+    def _draw_strip(
+        canvas: Canvas, sides: tuple[Any, Any], first: float, last: float, pieces: int, color: ArrayLike
+    ) -> None:
+        """Draw a strip along the road in pieces, because haze and headlights change along it."""
+        for near, far in pairwise(np.geomspace(first, last, pieces)):
+            corners = canvas.config.project(*sides, [near, near, far, far])
+            canvas.fill(corners, canvas.config.light.shade(color, float(np.sqrt(near * far))))
 
     def _draw_posts(
         self, canvas: Canvas, x: float, travel: float, *, every: float, top: float, width: float,
