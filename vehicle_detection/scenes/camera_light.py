@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import importlib.resources
+import json
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -96,7 +98,9 @@ class Light:
         return np.asarray(color, np.float64) * (gain * clear) + self.haze * (1 - clear)
 
 
-LIGHTS = ("day", "overcast", "dusk", "night")
+_FILE = importlib.resources.files("vehicle_detection.scenes") / "lights.json"
+_LIGHTS: dict[str, dict[str, Any]] = json.loads(_FILE.read_bytes())
+LIGHTS = tuple(_LIGHTS)
 
 
 def make_light(name: str, rain: float, rng: Rng) -> Light:
@@ -106,26 +110,12 @@ def make_light(name: str, rain: float, rng: Rng) -> Light:
     sun = np.array([side, 0.35 if dusk else rng.uniform(0.7, 1.3), rng.uniform(-0.8, 0.3)])
     right, up, ahead = (sun / np.linalg.norm(sun)).tolist()
     to_sun = (right, up, ahead)
-    # Every preset draws its values, so that those of one do not depend on which is requested.
-    presets = {
-        "day": Light(
-            (74, 122, 178), (178, 202, 220), rng.uniform(0.56, 0.68), rng.uniform(0.45, 0.6), to_sun,
-            (1.02, 1.0, 0.98), lamps=0.0, visibility=900.0, noise=2.2,
-        ),
-        "overcast": Light(
-            (168, 176, 182), (206, 210, 212), rng.uniform(0.74, 0.86), 0.1, to_sun,
-            (0.98, 1.0, 1.0), lamps=0.1, visibility=500.0, noise=2.6,
-        ),
-        "dusk": Light(
-            (92, 104, 138), (222, 172, 128), rng.uniform(0.5, 0.58), 0.22, to_sun,
-            (1.06, 0.98, 0.92), lamps=0.6, visibility=500.0, noise=3.2,
-        ),
-        "night": Light(
-            (10, 12, 20), (30, 30, 36), 0.8, 0.0, to_sun,
-            (1.0, 0.96, 0.88), lamps=1.0, visibility=400.0, noise=4.0, dark=True,
-        ),
-    }  # fmt: skip
-    light = presets[name]
+    # A pair is a range. Every preset draws its values: those of one do not depend on which is requested.
+    for preset, values in _LIGHTS.items():
+        pairs = {key: each for key, each in values.items() if isinstance(each, list) and len(each) == 2}
+        drawn = values | {key: rng.uniform(*each) for key, each in pairs.items()}
+        if preset == name:
+            light = Light(to_sun=to_sun, **drawn)
     if rain == 0:
         return light
     gray = np.array([166.0, 172.0, 176.0]) * (0.16 if light.dark else 0.75 if dusk else 1.0)

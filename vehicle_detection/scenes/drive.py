@@ -129,7 +129,7 @@ def make_traffic(scenario: str, duration: float, rng: Rng) -> tuple[Road, list[T
 
 def _stage(track: int, row: dict[str, Any], side: int, duration: float, rng: Rng) -> TrafficVehicle:
     """Return a vehicle of `_STAGED`; a lane change is in the middle of the drive."""
-    values = {}
+    values: dict[str, Any] = {}
     for name, value in row.items():
         if name not in ("lanes", "kinds"):
             drawn = rng.uniform(*value) if isinstance(value, tuple) else value

@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -53,22 +53,12 @@ class VehicleShape:
         return replace(self, **sizes | {"width": sizes["width"] * widening})
 
 
-_FILE = importlib.resources.files("vehicle_detection.scenes") / "vehicle_shapes.json"
-VEHICLE_SHAPES = {kind: VehicleShape(**shape) for kind, shape in json.loads(_FILE.read_bytes()).items()}
-
-COLORS: dict[str, Color] = {
-    "white": (226, 227, 225), "silver": (172, 176, 179), "gray": (112, 117, 121), "anthracite": (64, 68, 73),
-    "black": (27, 28, 31), "navy": (30, 42, 78), "blue": (42, 86, 148), "ice": (134, 158, 180),
-    "red": (164, 28, 30), "wine": (96, 24, 30), "green": (40, 70, 54), "beige": (170, 156, 126),
-    "brown": (84, 66, 54), "yellow": (212, 176, 52),
-}  # fmt: skip
-
+_DATA = json.loads((importlib.resources.files("vehicle_detection.scenes") / "vehicles.json").read_bytes())
+VEHICLE_SHAPES = {kind: VehicleShape(**shape) for kind, shape in _DATA["shapes"].items()}
 # Frequencies where none is requested; a truck is only drawn on request.
-KIND_WEIGHTS = {"hatchback": 29, "estate": 15, "sedan": 25, "mpv": 12, "suv": 13, "van": 6}
-COLOR_WEIGHTS = {
-    "white": 15, "silver": 19, "gray": 13, "anthracite": 11, "black": 12, "navy": 7, "blue": 6, "ice": 3,
-    "red": 6, "wine": 3, "green": 2, "beige": 2, "brown": 1, "yellow": 1,
-}  # fmt: skip
+KIND_WEIGHTS: dict[str, int] = _DATA["kind_weights"]
+COLORS: dict[str, Color] = {name: tuple(color) for name, (color, _) in _DATA["colors_and_weights"].items()}
+COLOR_WEIGHTS: dict[str, int] = {name: weight for name, (_, weight) in _DATA["colors_and_weights"].items()}
 
 
 def random_appearance(rng: Rng, kinds: Sequence[str] = tuple(KIND_WEIGHTS)) -> dict[str, Any]:
@@ -112,41 +102,8 @@ class VehicleAppearance:
         self.seed = int(rng.integers(2**31))
 
 
-class BodyShape:
-    """Shape, color and details of one vehicle; `view` is the end that the camera sees, rear or front."""
-
-    def __init__(
-        self, kind: str, color: str, seed: int, view: str, light: Light, widening: float = 1.0
-    ) -> None:
-        rng = np.random.default_rng([seed, 7])
-        dims = VEHICLE_SHAPES[kind].scaled(rng.uniform(0.96, 1.05), widening)
-        self.dimensions, self.view, self.light = dims, view, light
-        rear = view == "rear"
-        self.end, self.far_end = (dims.rear, dims.front) if rear else (dims.front, dims.rear)
-        self.overhang, self.far_overhang = dims.overhangs if rear else dims.overhangs[::-1]
-        self.color = np.clip(np.asarray(COLORS[color], np.float32) * rng.uniform(0.9, 1.1), 8, 240)
-        self.seed = seed
-        self.appearance = VehicleAppearance(kind, rng)
-
-    def half_width(self, y: ArrayLike) -> Doubles:
-        """Half of the body's width at heights `y`, in meters."""
-        dims = self.dimensions
-        if dims.is_box:
-            heights = [dims.clearance, dims.clearance + 0.1, dims.height - 0.03, dims.height]
-            ratios = [0.94, 1.0, 1.0, 0.98] if self.view == "rear" else [0.9, 0.97, 0.97, 0.9]
-        else:
-            cabin, roof = dims.height - dims.belt, dims.roof
-            heights = [
-                dims.clearance, dims.clearance + 0.12, 0.5 * dims.belt + 0.1, dims.belt - 0.12, dims.belt,
-                dims.belt + 0.8 * cabin, dims.height - 0.06, dims.height - 0.02, dims.height,
-            ]  # fmt: skip
-            ratios = [0.93, 0.985, 1.0, 0.99, 0.96, roof + 0.05, roof - 0.02, roof - 0.1, roof - 0.26]
-        return np.asarray(np.interp(np.asarray(y), heights, np.array(ratios) * dims.width / 2), np.float64)
-
-
 PIXELS_PER_METER = 112
-_FILE = importlib.resources.files("vehicle_detection.scenes") / "vehicle_paint.json"
-_LAYERS: dict[str, list[dict[str, Any]]] = json.loads(_FILE.read_bytes())
+_LAYERS: dict[str, list[dict[str, Any]]] = _DATA["paint"]
 # A term of a length such as "0.5*belt-0.2".
 _TERM = re.compile(r"([+-]?)(?:([\d.]+)\*?)?([a-z_]*)")
 
@@ -172,25 +129,11 @@ class Surface:
         return self._mipmaps[size], PIXELS_PER_METER * size[0] / width, PIXELS_PER_METER * size[1] / height
 
 
-@dataclass(frozen=True, eq=False)
-class Mask:
+class Mask(NamedTuple):
     """Coverage of pixels by a shape, 0-1, in the part of a canvas where the shape lies."""
 
     values: Floats
     region: tuple[slice, slice]  # rows and columns of the part
-    size: tuple[int, int]  # of the canvas
-
-    def _aligned(self, other: Mask) -> Floats:
-        """Values of another mask in this region, 0 where the other does not reach."""
-        values = np.zeros(self.size, np.float32)
-        values[other.region] = other.values
-        return values[self.region]
-
-    def __and__(self, other: Mask) -> Mask:
-        return replace(self, values=self.values * self._aligned(other))
-
-    def __sub__(self, other: Mask) -> Mask:
-        return replace(self, values=np.maximum(self.values - self._aligned(other), 0))
 
 
 class SurfaceCanvas:
@@ -206,18 +149,22 @@ class SurfaceCanvas:
         self.color: Floats = np.zeros((*self.size, 3), np.float32)
         self.alpha: Floats = np.zeros(self.size, np.float32)
 
-    def polygon(self, points: ArrayLike, *, soften: float = 0.0) -> Mask:
-        """Mask of a polygon of ``(x, y)`` points, blurred by `soften` meters."""
-        corners = (np.asarray(points, np.float64) - (self.left, self.top)) * (1, -1) * PIXELS_PER_METER - 0.5
+    def polygon(self, points: ArrayLike, *holes: ArrayLike, soften: float = 0.0) -> Mask:
+        """Mask of a polygon of ``(x, y)`` points with holes, blurred by `soften` meters."""
+        corners, *inner = (
+            (np.asarray(each, np.float64) - (self.left, self.top)) * (1, -1) * PIXELS_PER_METER - 0.5
+            for each in (points, *holes)
+        )
         margin = 2 + int(3 * soften * PIXELS_PER_METER)
         x1, y1 = np.maximum(np.floor(corners.min(0)).astype(int) - margin, 0).tolist()
         x2, y2 = np.minimum(np.ceil(corners.max(0)).astype(int) + margin + 1, self.size[::-1]).tolist()
         filled = np.zeros((y2 - y1, x2 - x1), np.uint8)
-        cv2.fillPoly(filled, [np.rint((corners - (x1, y1)) * 16).astype(np.int32)], 255, cv2.LINE_AA, 4)
+        outlines = [np.rint((each - (x1, y1)) * 16).astype(np.int32) for each in (corners, *inner)]
+        cv2.fillPoly(filled, outlines, 255, cv2.LINE_AA, 4)
         values = filled.astype(np.float32) / 255
         if soften:
             values = cv2.GaussianBlur(values, (0, 0), soften * PIXELS_PER_METER)  # type: ignore[assignment]
-        return Mask(np.asarray(values, np.float32), (slice(y1, y2), slice(x1, x2)), self.size)
+        return Mask(np.asarray(values, np.float32), (slice(y1, y2), slice(x1, x2)))
 
     def box(self, x: float, y: float, width: float, height: float, *, radius: float = 0.0) -> Mask:
         """Mask of a box centered at ``(x, y)`` with rounded corners."""
@@ -264,14 +211,14 @@ def round_corners(corners: ArrayLike, radius: float) -> Doubles:
 
 
 class BodyPainter:
-    """Paints the layers of one end or flank of a vehicle (``vehicle_paint.json``) on a canvas in its color.
+    """Paints the layers of one end or flank of a vehicle (``vehicles.json``) on a canvas in its color.
 
     What the shape of a layer covers is multiplied by a ``gain``, becomes a ``lamp`` or ``glass``, or is
     painted in a ``color``, ``lit`` by a factor. Lengths (m) may be sums of named ones, and a layer may depend
     on details of the vehicle (``if``).
     """
 
-    def __init__(self, body: BodyShape, canvas: SurfaceCanvas, reflection: Floats) -> None:
+    def __init__(self, body: VehicleBody, canvas: SurfaceCanvas, reflection: Floats) -> None:
         self.body, self.canvas = body, canvas
         self.reflection = reflection  # (H, W, 3) color of the surroundings in a mirror
         dims, look, light = body.dimensions, body.appearance, body.light
@@ -309,9 +256,8 @@ class BodyPainter:
         canvas, color, lit = self.canvas, layer.get("color"), layer.get("lit", 1.0)
         opacity = self._measure(layer.get("opacity", 1.0))
         for outline in self._outlines(layer):
-            mask = canvas.polygon(outline, soften=layer.get("soften", 0.0))
-            if "minus" in layer:
-                mask = mask - canvas.polygon(self._band(layer["minus"]))
+            holes = [self._band(layer["minus"])] if "minus" in layer else []
+            mask = canvas.polygon(outline, *holes, soften=layer.get("soften", 0.0))
             if "glass" in layer:
                 self.paint_glass(outline, seats=(-0.36, 0.36))
             elif "lamp" in layer:
@@ -362,8 +308,8 @@ class BodyPainter:
         cabin = np.array([34, 38, 42], np.float32) * (gain * look.glass_tint * self.body.light.ambient / 0.6)
         canvas.paint(pane, cabin * (0.8 + 0.5 * rise)[..., None])
         for x in seats:
-            seat = canvas.box(x, low + 0.1, 0.26, 0.34, radius=0.1)
-            canvas.paint(seat & pane, np.array([22, 24, 26]) * gain, 0.55)
+            seat = canvas.box(x, low + 0.14, 0.26, 0.26, radius=0.08)
+            canvas.paint(seat, np.array([22, 24, 26]) * gain, 0.55)
         ripple = 0.75 + 0.25 * np.sin(canvas.x * 5.0 + look.seed % 7) * np.cos(canvas.y * 9.0 + look.seed % 5)
         strength = (0.16 + 0.42 * look.glass_reflection) * (0.45 + 0.55 * rise) * ripple
         color, strength = canvas.color[pane.region], pane.values * strength[pane.region]
@@ -424,12 +370,11 @@ class BodyPainter:
         inner_low, inner_top = outer_low - look.lamp_width - lean, outer_top - look.lamp_width + lean
         self.names |= {"lamp_low": bottom, "lamp_top": top, "outer_low": outer_low, "outer_top": outer_top}
         self.names |= {"inner_low": inner_low, "inner_top": inner_top}
-        lens = (outer_low + outer_top + inner_low + inner_top) / 4, (bottom + top) / 2
-        lens += (0.07, look.lamp_height * 0.5)
+        middle = (outer_low + outer_top + inner_low + inner_top) / 4
         if look.tall_lamps:
-            lens = lens[0], bottom + 0.3 * look.lamp_height, look.lamp_width * 0.6, 0.055
+            lens = (middle, bottom + 0.3 * look.lamp_height, look.lamp_width * 0.6, 0.055)
         else:
-            lens = lens[0] - 0.3 * look.lamp_width, *lens[1:]
+            lens = (middle - 0.3 * look.lamp_width, (bottom + top) / 2, 0.07, look.lamp_height * 0.5)
         self.names |= zip(("lens", "lens_y", "lens_width", "lens_height"), lens)
 
     def paint_flank(self) -> None:
@@ -472,8 +417,36 @@ class BodyPainter:
                 canvas.paint(canvas.polygon(spoke + circle * dims.wheel_radius * 0.13), dark, 0.85)
 
 
-class VehicleBody(BodyShape):
-    """The painted surfaces of one vehicle."""
+class VehicleBody:
+    """Shape and painted surfaces of one vehicle; `view` is the end that the camera sees, rear or front."""
+
+    def __init__(
+        self, kind: str, color: str, seed: int, view: str, light: Light, widening: float = 1.0
+    ) -> None:
+        rng = np.random.default_rng([seed, 7])
+        dims = VEHICLE_SHAPES[kind].scaled(rng.uniform(0.96, 1.05), widening)
+        self.dimensions, self.view, self.light = dims, view, light
+        rear = view == "rear"
+        self.end, self.far_end = (dims.rear, dims.front) if rear else (dims.front, dims.rear)
+        self.overhang, self.far_overhang = dims.overhangs if rear else dims.overhangs[::-1]
+        self.color = np.clip(np.asarray(COLORS[color], np.float32) * rng.uniform(0.9, 1.1), 8, 240)
+        self.seed = seed
+        self.appearance = VehicleAppearance(kind, rng)
+
+    def half_width(self, y: ArrayLike) -> Doubles:
+        """Half of the body's width at heights `y`, in meters."""
+        dims = self.dimensions
+        if dims.is_box:
+            heights = [dims.clearance, dims.clearance + 0.1, dims.height - 0.03, dims.height]
+            ratios = [0.94, 1.0, 1.0, 0.98] if self.view == "rear" else [0.9, 0.97, 0.97, 0.9]
+        else:
+            cabin, roof = dims.height - dims.belt, dims.roof
+            heights = [
+                dims.clearance, dims.clearance + 0.12, 0.5 * dims.belt + 0.1, dims.belt - 0.12, dims.belt,
+                dims.belt + 0.8 * cabin, dims.height - 0.06, dims.height - 0.02, dims.height,
+            ]  # fmt: skip
+            ratios = [0.93, 0.985, 1.0, 0.99, 0.96, roof + 0.05, roof - 0.02, roof - 0.1, roof - 0.26]
+        return np.asarray(np.interp(np.asarray(y), heights, np.array(ratios) * dims.width / 2), np.float64)
 
     @cached_property
     def near_end(self) -> Surface:
