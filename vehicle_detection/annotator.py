@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vehicle_detection import drawing
 from vehicle_detection._common import (
     UNITS,
     Checked,
@@ -27,31 +28,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera, truncated_edges
-from vehicle_detection.drawing import (
-    BLACK,
-    BLUR_REGIONS,
-    TRACK_COLORS,
-    WHITE,
-    Color,
-    Image,
-    LabelPlacer,
-    LabelRequest,
-    Rectangle,
-    blur_boxes,
-    cap_height,
-    draw_boxes,
-    draw_labels,
-    draw_outline,
-    draw_text,
-    fill_rectangle,
-    heat_image,
-    hidden_area,
-    line_width_for,
-    round_box,
-    text_scale,
-    text_size,
-    track_color,
-)
+from vehicle_detection.drawing import Color, Image, Rectangle
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import HeatParams, frame_heat
 from vehicle_detection.tracking import FrameResult, Track
@@ -263,9 +240,9 @@ class BirdsEyePanel:
             scale = self._text_scale
             text = f"{distance} {chosen.distance_symbol}"
             if self._has_text:
-                top = y - cap_height(scale) - 6
-                draw_text(grid, [text], 0, top, scale, _TEXT_COLOR)
-                right, bottom = np.add((0, top), text_size([text], scale)).tolist()
+                top = y - drawing.cap_height(scale) - 6
+                drawing.draw_text(grid, [text], 0, top, scale, _TEXT_COLOR)
+                right, bottom = np.add((0, top), drawing.text_size([text], scale)).tolist()
                 self._texts.append((0, top, right, bottom))
         length, half = 4.2, 0.9
         corners = [(-half, -length), (half, -length), (half, -1.2), (0.0, 0.3), (-half, -1.2)]
@@ -313,13 +290,13 @@ class BirdsEyePanel:
         vehicles = taken[len(self._texts) :]
         for (_, track_id), (left, top, right, bottom) in reversed(list(zip(shown, vehicles))):
             text = [str(track_id)]
-            width, height = text_size(text, self._text_scale)
+            width, height = drawing.text_size(text, self._text_scale)
             row, column = (top + bottom - height) // 2, (left + right - width) // 2
             for x, y in ((right, row), (left - width, row), (column, bottom), (column, top - height)):
                 place = x, y, x + width, y + height
                 inside = x >= 0 and y >= 0 and place[2] <= self._width and place[3] <= len(panel)
-                if inside and not hidden_area(place, taken):
-                    draw_text(panel, text, x, y, self._text_scale, _OWN_COLOR)
+                if inside and not drawing.hidden_area(place, taken):
+                    drawing.draw_text(panel, text, x, y, self._text_scale, _OWN_COLOR)
                     taken.append(place)
                     break
 
@@ -391,7 +368,7 @@ class Annotator:
             got = describe(own_speed)
             raise InvalidInputError(f"own_speed must have a method at, got {got}; pass read_own_speed(...)")
         if blur is not None:
-            check.choice(blur, "blur", BLUR_REGIONS)
+            check.choice(blur, "blur", drawing.BLUR_REGIONS)
         check.flags(diagnostics=diagnostics)
         self.style = style or DrawParams()
         self.camera, self.heat, self.own_speed = camera, heat, own_speed
@@ -413,7 +390,7 @@ class Annotator:
     def reset(self, *, fps: float | None = None) -> None:
         """Forget all frames, before the first frame of another video; `fps` is for results without times."""
         self._fps = _USUAL_FPS if fps is None else check.number(fps, "fps", above=0)
-        self._placer = LabelPlacer()
+        self._placer = drawing.LabelPlacer()
         self._panel: BirdsEyePanel | None = None
         self._time = -math.inf
         self._coasting: set[int] = set()  # in the last searched frame
@@ -430,7 +407,9 @@ class Annotator:
         check.instance(result, "result", FrameResult, "pass what process or track returns")
         if self.blur is not None:
             tracked = np.array([track.box for track in result.tracks]).reshape(-1, 4)
-            frame = blur_boxes(frame, np.concatenate([tracked, result.detections.boxes]), region=self.blur)
+            frame = drawing.blur_boxes(
+                frame, np.concatenate([tracked, result.detections.boxes]), region=self.blur
+            )
         if self.diagnostics:
             heat = frame_heat(frame.shape, result.windows, self.heat or HeatParams())
             return draw_diagnostics(frame, result.windows, heat, result.tracks, params=self.style)
@@ -455,7 +434,7 @@ class Annotator:
         coasting = {track.id for track in shown if track.state == "coasting"}
         if searched:
             self._coasting = coasting
-        colors = [track_color(track, style.color_by) for track in shown]
+        colors = [drawing.track_color(track, style.color_by) for track in shown]
         beside = BirdsEyePanel.side_size(shape)[1] if style.panel == "side" else 0
         result = np.empty((shape[0], shape[1] + beside, 3), np.uint8)
         frame = result[:, : shape[1]]
@@ -466,15 +445,18 @@ class Annotator:
                 self._panel = BirdsEyePanel(shape, style.panel, style.units)
             view = Camera.for_frame(shape) if self.camera is None else self.camera.for_shape(shape)
             blocked.append(self._panel.draw(result, shown, colors, view, shape, self._time))
-        width = style.line_width or line_width_for(shape)
+        width = style.line_width or drawing.line_width_for(shape)
         dashed = coasting & self._coasting
         # Far to near: the boxes of near vehicles cover those behind them.
         for track, color in sorted(zip(shown, colors), key=lambda pair: float(pair[0].box[3])):
-            draw_outline(frame, round_box(track.box), color, width, dashed=track.id in dashed)
+            drawing.draw_outline(frame, drawing.round_box(track.box), color, width, dashed=track.id in dashed)
         speed = own_mps if math.isfinite(own_mps) else None
         fields = [tuple(track_fields(track, style.labels, style.units, speed)) for track in shown]
-        requests = [LabelRequest(track.id, each, round_box(track.box)) for track, each in zip(shown, fields)]
-        draw_labels(frame, self._placer.place(requests, shape, blocked), colors, width)
+        requests = [
+            drawing.LabelRequest(track.id, each, drawing.round_box(track.box))
+            for track, each in zip(shown, fields)
+        ]
+        drawing.draw_labels(frame, self._placer.place(requests, shape, blocked), colors, width)
         return result
 
 
@@ -561,8 +543,8 @@ def draw_diagnostics(
     style = dataclasses.replace(params or DrawParams(), panel="none")
     panels = {
         "frame": small,
-        "windows": draw_boxes(small, boxes * scale, color=TRACK_COLORS[1], thickness=1),
-        "heat": cv2.resize(heat_image(heat), (width, height)),
+        "windows": drawing.draw_boxes(small, boxes * scale, color=drawing.TRACK_COLORS[1], thickness=1),
+        "heat": cv2.resize(drawing.heat_image(heat), (width, height)),
         "tracks": Annotator(style).draw_tracks(small, scaled),
     }
     mosaic = np.zeros(checked.shape, np.uint8)  # not zeros_like: OpenCV needs rows in C order
@@ -570,8 +552,8 @@ def draw_diagnostics(
         top, left = index // 2 * height, index % 2 * width
         view = mosaic[top : top + height, left : left + width]
         view[:] = panel
-        scale = text_scale(view.shape)
-        title_width, title_height = text_size([title], scale)
-        fill_rectangle(view, (0, 0, title_width, title_height), BLACK, 0.6)
-        draw_text(view, [title], 0, 0, scale, WHITE)
+        scale = drawing.text_scale(view.shape)
+        title_width, title_height = drawing.text_size([title], scale)
+        drawing.fill_rectangle(view, (0, 0, title_width, title_height), drawing.BLACK, 0.6)
+        drawing.draw_text(view, [title], 0, 0, scale, drawing.WHITE)
     return mosaic

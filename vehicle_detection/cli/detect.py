@@ -18,14 +18,6 @@ import vehicle_detection as vd
 from vehicle_detection.cli import common
 from vehicle_detection.cli import options as shared
 from vehicle_detection.cli.horizon import is_limited, search_everywhere, warn_of_horizon
-from vehicle_detection.cli.options import (
-    camera_option,
-    check_blur,
-    drawing_option,
-    open_model,
-    output_option,
-    takes,
-)
 from vehicle_detection.cli.output import (
     DAMAGED,
     announce_replaced,
@@ -58,34 +50,34 @@ class DetectOptions:
     images: list[str] = Argument(
         ..., metavar="IMAGE...", help="Image files, such as frames/*.jpg; folders; URLs."
     )
-    output: Path | None = output_option(
+    output: Path | None = shared.output(
         None, "DIR", "Folder for annotated images, such as found.", "-o", "--output"
     )
-    boxes: Path | None = output_option(
+    boxes: Path | None = shared.output(
         None, "FILE", "Boxes by file name: .csv, .jsonl, .parquet or .json (COCO)."
     )
-    why: Path | None = output_option(
+    why: Path | None = shared.output(
         None, "DIR", "Folder, such as why, for pictures that explain each box: the share of each cell."
     )
     model: str = shared.MODEL
     classes: str | None = shared.CLASSES
     device: str = shared.DEVICE
-    jobs: int | None = shared.search_option(
+    jobs: int | None = shared.search(
         None, "N", "Images searched in parallel, such as 2; default: one per core."
     )
     conf: float | None = shared.CONFIDENCE
     camera: str | None = shared.CAMERA
-    fov: float | None = camera_option(
+    fov: float | None = shared.camera(
         None, "DEG", "Field of view along the longer side in degrees, such as 90, to state distances."
     )
     camera_height: float | None = shared.CAMERA_HEIGHT
     horizon: float | None = shared.HORIZON
-    labels: str = drawing_option("score", "score|none", "Labels of the boxes in annotated images.")
+    labels: str = shared.drawing("score", "score|none", "Labels of the boxes in annotated images.")
     line_width: int | None = shared.LINE_WIDTH
     blur: str | None = shared.BLUR
 
 
-@takes(DetectOptions)
+@shared.takes(DetectOptions)
 def detect(options: DetectOptions) -> None:
     """Detect the vehicles of images.
 
@@ -95,7 +87,7 @@ def detect(options: DetectOptions) -> None:
         images = list(dict.fromkeys(itertools.chain.from_iterable(map(_expand, options.images))))
     _check(options, images)
     left_out: list[_Image] = []
-    loaded = open_model(options.model, options.classes, options.device)
+    loaded = shared.open_model(options.model, options.classes, options.device)
     camera = vd.open_camera(
         options.camera, fov=options.fov, height_m=options.camera_height, horizon=options.horizon
     )
@@ -167,7 +159,7 @@ def _check(options: DetectOptions, images: list[_Image]) -> None:
         )
     if boxes is not None:
         common.check_suffix(boxes, "--boxes", (".csv", ".jsonl", ".ndjson", ".parquet", ".json"))
-    check_blur(options.blur)
+    shared.check_blur(options.blur)
     unseen = options.blur and not output and not options.why
     refuse_if(unseen, "--output must name a folder for --blur, which blurs annotated images; add it")
 

@@ -55,46 +55,44 @@ def takes(options: type[Options]) -> Callable[[Callable[[Options], None]], Calla
 
 
 # Options in a panel of the help.
-input_option, input_flag = (functools.partial(each, panel="Input") for each in (option, flag))
-camera_option = functools.partial(option, panel="Camera")
-search_option = functools.partial(option, panel="Search")
-drawing_option, drawing_flag = (functools.partial(each, panel="Drawing") for each in (option, flag))
-output_option, output_flag = (functools.partial(each, panel="Output") for each in (option, flag))
+source, source_flag = (functools.partial(each, panel="Input") for each in (option, flag))
+camera = functools.partial(option, panel="Camera")
+search = functools.partial(option, panel="Search")
+drawing, drawing_flag = (functools.partial(each, panel="Drawing") for each in (option, flag))
+output, output_flag = (functools.partial(each, panel="Output") for each in (option, flag))
 
-MODEL = search_option(
+MODEL = search(
     "default",
     "NAME|FILE",
     '"default" (any road), "highway" (the course\'s), or a model file, such as yolo11n.onnx.',
 )
-CLASSES = search_option(
+CLASSES = search(
     None, "LIST", "Classes of another library's network that are vehicles, such as car,bus,truck or 2,5,7."
 )
-DEVICE = search_option("cpu", "cpu|cuda", "Where a network runs; cuda needs the package onnxruntime-gpu.")
-CONFIDENCE = search_option(
+DEVICE = search("cpu", "cpu|cuda", "Where a network runs; cuda needs the package onnxruntime-gpu.")
+CONFIDENCE = search(
     None, "P", "Minimum confidence, a probability from 0 to 1, such as 0.5; default: the model's threshold."
 )
-EVERY = search_option(
+EVERY = search(
     None, "N", "Search every N-th frame, and interpolate between; 1: every frame; default: 12 a second."
 )
-HORIZON = camera_option(None, "F", HORIZON_HELP)
-CAMERA = camera_option(
+HORIZON = camera(None, "F", HORIZON_HELP)
+CAMERA = camera(
     None,
     "NAME|FILE",
     "Lens: standard-58, wide-90, fisheye-120, fisheye-140 or fisheye-170; or a file (JSON; OpenCV, ROS).",
 )
-FIELD_OF_VIEW = camera_option(
+FIELD_OF_VIEW = camera(
     None, "DEG", "Field of view along the longer side in degrees, such as 90; default: 58, with a warning."
 )
-CAMERA_HEIGHT = camera_option(
-    None, "M", "Height of the lens above the road in meters, such as 1.5; default: 1.3."
-)
-LINE_WIDTH = drawing_option(
+CAMERA_HEIGHT = camera(None, "M", "Height of the lens above the road in meters, such as 1.5; default: 1.3.")
+LINE_WIDTH = drawing(
     None, "N", "Width of the boxes' lines in pixels, such as 3; default: by size of the frame."
 )
-BLUR = drawing_option(
+BLUR = drawing(
     None, "vehicles|plates", "Blur the vehicles, or the region of their plates, in what is written."
 )
-PRESET = output_option(
+PRESET = output(
     "veryfast", "NAME", "Speed of the encoder, from ultrafast (large files) to placebo (small ones)."
 )
 NO_AUDIO = output_flag("--no-audio", "Write no sound.")

@@ -17,29 +17,8 @@ from typer import Argument
 
 import vehicle_detection as vd
 from vehicle_detection.cli import common
+from vehicle_detection.cli import horizon as rows
 from vehicle_detection.cli import options as shared
-from vehicle_detection.cli.horizon import (
-    is_limited,
-    parse_horizon,
-    search_everywhere,
-    warn_of_horizon,
-    with_found_horizon,
-)
-from vehicle_detection.cli.options import (
-    HORIZON_HELP,
-    camera_option,
-    check_blur,
-    drawing_flag,
-    drawing_option,
-    input_flag,
-    input_option,
-    open_model,
-    output_flag,
-    output_option,
-    parse_time,
-    search_option,
-    takes,
-)
 from vehicle_detection.cli.output import (
     DAMAGED,
     UNKNOWN_LENS,
@@ -71,95 +50,97 @@ class VideoOptions:
         help="Video file, such as drive.mp4; folder or quoted pattern of a trip's segments, or images; "
         "URL; camera, such as 0; or -.",
     )
-    output: Path | None = output_option(
+    output: Path | None = shared.output(
         None,
         "TARGET",
         "Video to write: .mp4, .m4v, .mov or .mkv; default: beside the source, such as drive_tracked.mp4.",
         "-o",
         "--output",
     )
-    show: bool = output_flag("--show", "Show the annotated frames in a window; Escape ends the run.")
-    tracks: Path | None = output_option(
+    show: bool = shared.output_flag("--show", "Show the annotated frames in a window; Escape ends the run.")
+    tracks: Path | None = shared.output(
         None, "FILE", "Tracks: .csv, .jsonl, .parquet, .txt (MOT), .zip (CVAT) or .json (COCO)."
     )
-    report: Path | None = output_option(None, "FILE.html", "Page with the video and its tracks.")
-    why: bool = output_flag("--why", "Explain a box of each vehicle in --report: the share of each cell.")
-    events: Path | None = output_option(
+    report: Path | None = shared.output(None, "FILE.html", "Page with the video and its tracks.")
+    why: bool = shared.output_flag(
+        "--why", "Explain a box of each vehicle in --report: the share of each cell."
+    )
+    events: Path | None = shared.output(
         None, "FILE", "Events, such as cut-ins and overtaking: .csv or .json."
     )
-    clips: Path | None = output_option(
+    clips: Path | None = shared.output(
         None, "DIR", "Folder for a short annotated clip of each event, such as clips."
     )
-    clips_of: str | None = output_option(
+    clips_of: str | None = shared.output(
         None, "KINDS", "Kinds of events for --clips, such as cut_in,closing; default: all."
     )
-    srt: Path | None = output_option(
+    srt: Path | None = shared.output(
         None, "FILE", "Subtitles with vehicles, nearest distance and events, second by second: .srt or .ass."
     )
     preset: str = shared.PRESET
-    crf: int | None = output_option(None, "N", "Quality of the video, 0 (best) to 51; default: 23.")
-    encoder: str = output_option(
+    crf: int | None = shared.output(None, "N", "Quality of the video, 0 (best) to 51; default: 23.")
+    encoder: str = shared.output(
         "x264", "NAME", "x264, nvenc, vaapi, videotoolbox, or auto: a graphics processor's if one works."
     )
     no_audio: bool = shared.NO_AUDIO
-    quiet: bool = output_flag("-q", "Print errors and warnings of damage only.", "--quiet")
-    profile: bool = output_flag("--profile", "Print the processor time and the waiting of each stage.")
-    start: str | None = input_option(None, "TIME", "Start time, such as 12.5 (seconds) or 12:30.")
-    end: str | None = input_option(None, "TIME", "End time, such as 30 (seconds) or 1:02:06.")
-    fps: float | None = input_option(
+    quiet: bool = shared.output_flag("-q", "Print errors and warnings of damage only.", "--quiet")
+    profile: bool = shared.output_flag("--profile", "Print the processor time and the waiting of each stage.")
+    start: str | None = shared.source(None, "TIME", "Start time, such as 12.5 (seconds) or 12:30.")
+    end: str | None = shared.source(None, "TIME", "End time, such as 30 (seconds) or 1:02:06.")
+    fps: float | None = shared.source(
         None, "N", "Frame rate of images, a raw stream such as .h264, a pipe or a camera, such as 10."
     )
-    stream: int | None = input_option(
+    stream: int | None = shared.source(
         None, "N", "Video stream of a file with several, by ffmpeg's number, such as 1."
     )
-    own_speed: str | None = input_option(
+    own_speed: str | None = shared.source(
         None, "SPEED", "Own speed in km/h, such as 100, or 62mph, for headways and speeds over ground."
     )
-    gpx: Path | None = input_option(
+    gpx: Path | None = shared.source(
         None,
         "FILE",
         "Own speed over time: a GPX track, NMEA sentences, or a .csv table with time_s and speed_kmh.",
     )
-    gpx_offset: float = input_option(
+    gpx_offset: float = shared.source(
         0.0,
         "S",
         "Time of the video's start in --gpx: seconds after the first point of a track, or the "
         "time_s of a table, such as 12.5 or -3.",
     )
-    live: bool = input_flag(
+    live: bool = shared.source_flag(
         "--live", "Drop frames of a pipe rather than lag; default for cameras and streams."
     )
-    no_reconnect: bool = input_flag("--no-reconnect", "End with a network stream that breaks off.")
-    strict: bool = input_flag("--strict", "Fail, and write nothing, if the source is damaged.")
+    no_reconnect: bool = shared.source_flag("--no-reconnect", "End with a network stream that breaks off.")
+    strict: bool = shared.source_flag("--strict", "Fail, and write nothing, if the source is damaged.")
     camera: str | None = shared.CAMERA
     fov: float | None = shared.FIELD_OF_VIEW
     camera_height: float | None = shared.CAMERA_HEIGHT
-    horizon: str | None = camera_option(
-        None, "F|auto", f'{HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.'
+    horizon: str | None = shared.camera(
+        None, "F|auto", f'{shared.HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.'
     )
     model: str = shared.MODEL
     classes: str | None = shared.CLASSES
     device: str = shared.DEVICE
     conf: float | None = shared.CONFIDENCE
     every: int | None = shared.EVERY
-    jobs: int | None = search_option(
+    jobs: int | None = shared.search(
         None, "N", "Frames searched in parallel, such as 2; default: one per core, at most 4."
     )
-    labels: str = drawing_option(
+    labels: str = shared.drawing(
         "id,distance,speed",
         "LIST",
         "Fields of the labels: some of id,distance,speed,score,std, such as id,distance; or none.",
     )
     line_width: int | None = shared.LINE_WIDTH
-    color_by: str = drawing_option("id", "id|distance", "What the colors of the boxes stand for.")
-    panel: str = drawing_option(
+    color_by: str = shared.drawing("id", "id|distance", "What the colors of the boxes stand for.")
+    panel: str = shared.drawing(
         "none", "corner|side|none", "Bird's-eye view in the frame's corner, or beside it."
     )
-    units: str = drawing_option(
+    units: str = shared.drawing(
         "metric", "metric|imperial", "Labels, subtitles and report in m and km/h, or ft and mph."
     )
     blur: str | None = shared.BLUR
-    diagnostics: bool = drawing_flag(
+    diagnostics: bool = shared.drawing_flag(
         "--diagnostics", "Show frame, positive windows, heat map and tracks side by side."
     )
 
@@ -187,7 +168,10 @@ class VideoOptions:
 
     def span(self) -> dict[str, Any]:
         """First and last second of the part to process."""
-        return {"start": parse_time(self.start, "--start"), "end": parse_time(self.end, "--end")}
+        return {
+            "start": shared.parse_time(self.start, "--start"),
+            "end": shared.parse_time(self.end, "--end"),
+        }
 
     def encoding(self) -> Any:
         """How the copy is encoded."""
@@ -197,7 +181,7 @@ class VideoOptions:
 
     def stated_horizon(self) -> float | None:
         """Return the horizon that the option states; None if it states none, or is to be estimated."""
-        return None if self.horizon in (None, "auto") else parse_horizon(str(self.horizon))
+        return None if self.horizon in (None, "auto") else rows.parse_horizon(str(self.horizon))
 
     def draw_params(self) -> vd.DrawParams:
         """Parameters of the annotations."""
@@ -213,7 +197,7 @@ class VideoOptions:
 
 
 @option_names(target="--output", height_m="--camera-height")
-@takes(VideoOptions)
+@shared.takes(VideoOptions)
 def video(options: VideoOptions) -> None:
     """Track the vehicles of a video, and write or show an annotated copy.
 
@@ -301,7 +285,7 @@ def _check(options: VideoOptions) -> None:
     )
     both = options.diagnostics and options.panel != "none"
     refuse_if(both, "--panel has no place with --diagnostics; omit one of them")
-    check_blur(options.blur)
+    shared.check_blur(options.blur)
     options.encoding()
     unseen = options.blur and not target and not screen
     refuse_if(unseen, f"{needs_video} --blur, which blurs its vehicles; add it")
@@ -316,7 +300,7 @@ def _open(options: VideoOptions) -> Iterator[tuple[FrameSource, vd.VehicleDetect
     camera = vd.open_camera(
         options.camera, fov=options.fov, height_m=options.camera_height, horizon=options.stated_horizon()
     )
-    model = open_model(options.model, options.classes, options.device)
+    model = shared.open_model(options.model, options.classes, options.device)
     with options.open_source() as source:
         if speed is not None:
             speed = replace(speed, clock=vd.drive.segment_clock(source))
@@ -329,7 +313,7 @@ def _open(options: VideoOptions) -> Iterator[tuple[FrameSource, vd.VehicleDetect
                 camera.for_shape(source.info.shape)
                 _check_run(options, source, unsure)
             known = {"height_m": options.camera_height, **options.span()}
-            camera = with_found_horizon(
+            camera = rows.with_found_horizon(
                 camera, source, model, conf=options.conf, quiet=options.quiet, **known
             )
         with vd.VehicleDetector(model, conf=options.conf, camera=camera, annotator=annotator) as detector:
@@ -346,7 +330,7 @@ def _warn_of_camera(
         if not detector.camera.lens_is_known:
             print_error(UNKNOWN_LENS)
         return
-    if not source.rereadable or not is_limited(detector.detector):
+    if not source.rereadable or not rows.is_limited(detector.detector):
         return
     if options.stated_horizon() is not None:
         given = f"--horizon {options.horizon}"
@@ -354,8 +338,11 @@ def _warn_of_camera(
         given = f"the horizon of --camera {options.camera}"
     else:
         return
-    with options.open_source() as again, search_everywhere(detector.model, options.conf) as everywhere:
-        warn_of_horizon(given, estimate_video_horizon(again, everywhere, **options.span()))
+    with (
+        options.open_source() as again,
+        rows.search_everywhere(detector.model, options.conf) as everywhere,
+    ):
+        rows.warn_of_horizon(given, estimate_video_horizon(again, everywhere, **options.span()))
 
 
 def read_speed(own_speed: str | None, gpx: Path | None, offset: float) -> vd.drive.OwnSpeed | None:
