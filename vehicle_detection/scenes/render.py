@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection.scenes.camera_light import Doubles, Floats, Image, SceneConfig, alpha_over
 from vehicle_detection.scenes.scenery import Canvas, Scenery, draw_layer
-from vehicle_detection.scenes.vehicles import PIXELS_PER_METER, VehicleBody, profile_at
+from vehicle_detection.scenes.vehicles import PIXELS_PER_METER, Surface, VehicleBody, profile_at
 
 NEAR_PLANE = 1.0  # distance from which on anything is drawn (m)
 _INVERSE = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -194,12 +194,12 @@ def draw_sprite(pose: VehiclePose, config: SceneConfig) -> Sprite | None:
         return None
     buffer = _SpriteBuffer(config, left, top, right, bottom, samples=2 if x2 - x1 < 240 else 1)
     if pose.distance > NEAR_PLANE:
-        _draw_underside(buffer, pose)
+        _draw_end(buffer, pose, pose.body.underside, pose.distance)
     for side in (-1, 1):
         if side * pose.lateral < -dims.width / 2:
             _draw_flank(buffer, pose, side)
     if pose.start > NEAR_PLANE:
-        _draw_near_end(buffer, pose)
+        _draw_end(buffer, pose, pose.body.near_end, pose.start)
     sprite = buffer.sprite()
     return sprite if sprite.solid.any() else None
 
@@ -241,20 +241,6 @@ class _SpriteBuffer:
             size = (rgba.shape[1] // self.samples, rgba.shape[0] // self.samples)
             rgba = np.asarray(cv2.resize(rgba, size, interpolation=cv2.INTER_AREA), np.float32)
         return Sprite(rgba, self.left, self.top)
-
-
-def _draw_underside(buffer: _SpriteBuffer, pose: VehiclePose) -> None:
-    """Draw tires and underside: an upright plane across the road, so a scaling."""
-    config, surface, samples = buffer.config, pose.body.underside, buffer.samples
-    scale = config.camera.focal_px / pose.distance * samples
-    rgba, across, upwards = surface.mipmap(PIXELS_PER_METER / scale, PIXELS_PER_METER / scale)
-    x, y = config.project(pose.lateral + surface.left, surface.top, pose.distance).tolist()
-    sx, sy = across / scale, upwards / scale
-    shift_x = (0.5 - (x - buffer.left) * samples) * sx - 0.5
-    shift_y = (0.5 - (y - buffer.top) * samples) * sy - 0.5
-    height, width = buffer.rgba.shape[:2]
-    matrix = np.array([[sx, 0, shift_x], [0, sy, shift_y]])
-    buffer.composite(slice(0, width), cv2.warpAffine(rgba, matrix, (width, height), flags=_INVERSE))
 
 
 def _draw_flank(buffer: _SpriteBuffer, pose: VehiclePose, side: int) -> None:
@@ -308,16 +294,15 @@ def _draw_flank(buffer: _SpriteBuffer, pose: VehiclePose, side: int) -> None:
     buffer.composite(columns, layer)
 
 
-def _draw_near_end(buffer: _SpriteBuffer, pose: VehiclePose) -> None:
-    """Draw the near end: the intersection of each ray with its curved surface, by fixed-point iteration.
+def _draw_end(buffer: _SpriteBuffer, pose: VehiclePose, surface: Surface, start: float) -> None:
+    """Draw the near end, or tires and underside: the intersection of each ray with a surface across the road.
 
     A ray is at ``(right * z, height + up * z, z)``, the surface at ``z = start + depth(x, y)``: a point on
-    the ray gives a depth, the depth the next point.
+    the ray gives a depth, the depth the next point (fixed-point iteration).
     """
-    config, surface, start = buffer.config, pose.body.near_end, pose.start
+    config = buffer.config
     scale = config.camera.focal_px / start * buffer.samples
     rgba, across, upwards = surface.mipmap(PIXELS_PER_METER / scale, PIXELS_PER_METER / scale)
-    assert surface.depth is not None
     sides = pose.lateral + np.array([-0.5, 0.5, -0.5, 0.5]) * pose.body.dimensions.width
     columns = buffer.columns(sides, start + np.array([0.0, 0.0, 2.5, 2.5]))
     if columns.stop <= columns.start:
@@ -331,7 +316,7 @@ def _draw_near_end(buffer: _SpriteBuffer, pose: VehiclePose) -> None:
         x = (right * ahead - left) * np.float32(x_scale) - 0.5
         return x, (top - up * ahead) * np.float32(y_scale) - 0.5
 
-    for _ in range(4):
+    for _ in range(4 if surface.depth is not None else 0):
         x, y = surface_pixels(PIXELS_PER_METER, PIXELS_PER_METER)
         depth = cv2.remap(surface.depth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         ahead = np.asarray(np.float32(start) + depth, np.float32)
