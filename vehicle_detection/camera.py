@@ -261,13 +261,18 @@ class Camera(Checked):
                     f"camera must be one for frames of {size[1]}x{size[0]} pixels or the same aspect ratio, "
                     f"got one for {width}x{height}; use Camera.for_frame(image.shape, ...)"
                 )
-        return dataclasses.replace(
-            self,
+        return self.with_values(
             focal_px=focal_scale * self.focal_px,
             horizon_px=row_scale * self.horizon_px,
             horizon_std_px=row_scale * self.horizon_std_px,
             shape=size,
         )
+
+    def with_values(self, **values: Any) -> Camera:
+        """Return a copy with values that the library has computed, which are not checked."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self), **values)
+        return other
 
     @property
     def horizon(self) -> float:

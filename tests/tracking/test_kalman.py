@@ -19,7 +19,6 @@ from vehicle_detection.tracking.kalman import (
     predict,
     update,
 )
-from vehicle_detection.tracking.track import TrackState
 
 SHAPE = (720, 1280)
 BOXES = np.array([[600.0, 400, 700, 490], [100, 300, 180, 420]])
@@ -236,11 +235,11 @@ def test_a_box_that_reaches_the_border_as_predicted_is_not_corrected_there():
     smoother, boxes = KalmanSmoother(TrackParams()), np.array([[1200.0, 300, 1300, 400]])
     states = states_of(*initiate(boxes, np.full((1, 4), 5.0)))
     inside = Measurements.from_boxes(np.array([[1200.0, 300, 1280, 400]]), SHAPE)
-    after = smoother.correct(states, [TrackState(1.0)], inside, 0.04)
+    after = smoother.correct(states, np.zeros(1), inside, 0.04)
     np.testing.assert_allclose(after.boxes(), boxes, atol=1e-3)
     # A prediction that ends before the border is corrected.
     states = states_of(*initiate(np.array([[1200.0, 300, 1260, 400]]), np.full((1, 4), 5.0)))
-    assert smoother.correct(states, [TrackState(1.0)], inside, 0.04).boxes()[0, 2] > 1262
+    assert smoother.correct(states, np.zeros(1), inside, 0.04).boxes()[0, 2] > 1262
 
 
 def test_an_edge_where_a_nearer_vehicle_begins_corrects_little():
@@ -251,7 +250,7 @@ def test_an_edge_where_a_nearer_vehicle_begins_corrects_little():
 
     def right_edge(measured, hidden):
         measurements = Measurements.from_boxes(measured, SHAPE, hidden=hidden)
-        return smoother.correct(states, [TrackState(1.0)], measurements, 0.04).boxes()[0, 2]
+        return smoother.correct(states, np.zeros(1), measurements, 0.04).boxes()[0, 2]
 
     assert 700 - right_edge(boxes - step, hidden) < 0.1 * (700 - right_edge(boxes - step, False))
     # A vehicle that is visible beyond its predicted edge reaches at least as far.
@@ -263,7 +262,7 @@ def test_correlated_errors_correct_less_at_high_frame_rates():
     states = states_of(*initiate(boxes, np.full((1, 4), 5.0)))
     measured = Measurements.from_boxes(boxes + 2, SHAPE)
     for dt, frames in ((0.04, 5.0), (0.4, 1.0)):
-        after = KalmanSmoother(params).correct(states, [TrackState(1.0)], measured, dt)
+        after = KalmanSmoother(params).correct(states, np.zeros(1), measured, dt)
         noise = np.square(np.array([100, 90, 100, 90]) * params.measurement_noise) * frames
         expected, _ = textbook(states.mean[0], states.cov[0], measured.boxes[0], noise)
         np.testing.assert_allclose(after.mean[0], expected)
@@ -276,16 +275,16 @@ def test_the_motion_of_a_vehicle_that_was_not_detected_for_long_is_unknown():
     smoother = KalmanSmoother(TrackParams())
     mean, cov, _ = moving_states()
     states = states_of(mean, cov)._replace(innovation_mean=np.ones((2, 4)))
-    tracks = [TrackState(1.0, last_gap=gap) for gap in (0.4, 0.6)]
+    gaps = np.array([0.4, 0.6])
     measured = Measurements.from_boxes(BOXES + 9.0, SHAPE)
-    after = smoother.correct(states, tracks, measured, 0.08)
+    after = smoother.correct(states, gaps, measured, 0.08)
     for column, new in zip(after, smoother.initiate(measured)):
         np.testing.assert_allclose(column[1], new[1])
     assert not after.innovation_mean[1].any()
     # After a shorter time, and where it is merged with another vehicle, the state is only corrected.
     np.testing.assert_allclose(after.mean[0, 4], 30, atol=5)
     merged = Measurements.from_boxes(BOXES + 9.0, SHAPE, merged=True)
-    np.testing.assert_allclose(smoother.correct(states, tracks, merged, 0.08).mean[1, 4], -80, atol=5)
+    np.testing.assert_allclose(smoother.correct(states, gaps, merged, 0.08).mean[1, 4], -80, atol=5)
 
 
 def test_the_way_of_a_coasting_track_is_the_integral_of_its_speed():

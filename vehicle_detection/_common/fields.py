@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Collection
 from dataclasses import MISSING, dataclass
-from typing import Any, Self
+from typing import Any
 
 from vehicle_detection._common import check
 
@@ -66,9 +66,3 @@ class Checked:
             value = getattr(self, each.name)
             if "check" in each.metadata and not (value is None and each.default is None):
                 object.__setattr__(self, each.name, each.metadata["check"](value, each.name))
-
-    def with_values(self, **values: Any) -> Self:
-        """Return a copy with values that the library has computed, which are not checked."""
-        other = object.__new__(type(self))
-        vars(other).update(vars(self), **values)
-        return other

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import os
 import threading
@@ -124,7 +125,7 @@ class NetworkModel(Checked):
     runtime: Runtime = "auto"
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
+    @functools.cached_property
     def calibration(self) -> Platt:
         """Probability that a box contains a vehicle, by its score: the log-odds above the threshold.
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import Floats
 from vehicle_detection.camera import Camera, FrameShape, lateral_offsets, truncated_edges
-from vehicle_detection.tracking.track import TrackParams, TrackState
+from vehicle_detection.tracking.track import TrackParams
 
 Bools = NDArray[np.bool_]
 
@@ -166,10 +166,8 @@ class KalmanSmoother:
         scale = np.minimum(mean[:, [2, 3] * 4] * _MAX_STD / std, 1.0)
         return states._replace(mean=mean, cov=cov * scale[:, :, None] * scale[:, None, :])
 
-    def correct(
-        self, states: KalmanStates, tracks: Sequence[TrackState], measured: Measurements, dt: float
-    ) -> KalmanStates:
-        """Correct the boxes of tracks by a measurement each."""
+    def correct(self, states: KalmanStates, gaps: Floats, measured: Measurements, dt: float) -> KalmanStates:
+        """Correct the boxes of tracks by a measurement each, before which they had none for `gaps` seconds."""
         params, mean, boxes = self._params, states.mean, measured.boxes
         # A truncated edge says only that the vehicle reaches the border: no correction if it is predicted to.
         is_outside = (boxes_from_states(mean) - boxes) * OUTWARD >= 0
@@ -181,7 +179,7 @@ class KalmanSmoother:
         variance = np.where(beyond, UNKNOWN, noise)
         doubtful = measured.merged | measured.unsure
         corrected = KalmanStates(*update(*states[:3], boxes, variance, doubtful, dt), *states[3:])
-        again = np.array([track.last_gap > _MAX_VELOCITY_AGE for track in tracks]) & ~measured.merged
+        again = (gaps > _MAX_VELOCITY_AGE) & ~measured.merged
         if again.any():
             new = (*self.initiate(measured), np.zeros((len(boxes), 4)))
             for column, values in zip(corrected, new):

@@ -13,9 +13,10 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,7 @@ from vehicle_detection.tracking.kalman import (
     coasted_distance,
     exit_times,
 )
-from vehicle_detection.tracking.track import TIME_TOLERANCE, Track, TrackParams, TrackState, weight_of
+from vehicle_detection.tracking.track import TIME_TOLERANCE, UNKNOWN_LABEL, Track, TrackParams
 
 # Visible fraction of a box below which its vehicle leaves the frame if it moves outwards, and below which it
 # has left; covered fractions above which a vehicle is hidden, and above which nothing of it is visible.
@@ -71,6 +72,105 @@ _PART_GAP = 2.0
 _MAX_DETECTIONS = 500
 # Seconds without a detection after which `max_distance` stops growing.
 _MAX_GAP = 2.0
+
+
+def weight_of(dt: float, params: TrackParams) -> float:
+    """Weight of a frame in the exponential moving average of scores, `dt` seconds after the frame before."""
+    return -math.expm1(-dt / params.score_time_constant)
+
+
+@dataclass(eq=False, slots=True)
+class TrackState:
+    """Life cycle of a track; its Kalman states are a row of `KalmanStates`. Times are in seconds."""
+
+    score: float
+    weight: float = 1.0  # sum of the weights that the detections have in the score
+    mean_score: float = field(init=False)  # mean of the detections' scores with these weights
+    confirm_at_birth: bool = False  # whether its first detection suffices to confirm it
+    key: int = 0
+    id: int = 0
+    hits: int = 1
+    misses: int = 0  # since the last detection
+    all_misses: int = 0
+    age: float = 0.0
+    time_since_update: float = 0.0
+    last_gap: float = 0.0  # time without a detection before the last one
+    unexplained_gap: float = 0.0  # time without a detection while no other vehicle hides it
+    hidden_gap: float = 0.0  # time without a detection while another vehicle hides it
+    coast_budget: float = 0.0  # time for which it is still shown without a detection
+    covered_budget: float = 0.0  # time for which it is still shown while nothing of it is visible
+    hidden: bool = False  # whether another vehicle explains the missing detection
+    covered: float = 0.0  # fraction of its box that nearer vehicles cover
+    lost: bool = False  # whether its predicted position is only a guess
+    votes: Counter[str] = field(default_factory=Counter)  # number of detections of each class
+
+    def __post_init__(self) -> None:
+        self.mean_score = self.score / self.weight
+
+    @property
+    def state(self) -> Literal["tentative", "confirmed", "coasting"]:
+        """Stage of the life cycle."""
+        if not self.id:
+            return "tentative"
+        return "coasting" if self.misses else "confirmed"
+
+    @property
+    def label(self) -> str:
+        """Class of most of its detections."""
+        return max(self.votes, key=self.votes.__getitem__, default=UNKNOWN_LABEL)
+
+    @property
+    def shown(self) -> bool:
+        """Whether to draw it."""
+        if not self.id or self.lost:
+            return False
+        if self.misses and self.hidden:  # shown for as long as it was detected before
+            long_enough = 2 * self.time_since_update < self.age + TIME_TOLERANCE
+            return long_enough and self.covered_budget > -TIME_TOLERANCE
+        return not self.misses or self.coast_budget > -TIME_TOLERANCE
+
+    def update_score(self, score: float | None, dt: float, params: TrackParams) -> None:
+        """Advance by a frame, with the score of the assigned detection, or None without one."""
+        new = weight_of(dt, params)
+        self.score = (1 - new) * self.score + new * (score or 0.0)
+        self.weight = (1 - new) * self.weight + new * (score is not None)
+        self.age += dt
+        self.hidden = self.lost = False
+        if score is None:
+            self.misses += 1
+            self.all_misses += 1
+            self.time_since_update += dt
+        else:
+            self.mean_score = self.score / self.weight
+            self.hits += 1
+            self.last_gap = self.time_since_update
+            self.misses, self.time_since_update = 0, 0.0
+            self.unexplained_gap, self.hidden_gap, self.covered_budget = 0.0, 0.0, params.show_covered
+            self.coast_budget = min(self.coast_budget + dt, params.show_coast) if self.id else 0.0
+
+    def mark_missed(self, dt: float, *, hidden: bool, covered: bool, lost: bool) -> None:
+        """Account for a frame without a detection, behind another vehicle or for an unknown reason."""
+        self.hidden, self.lost = hidden, lost
+        if hidden:
+            self.hidden_gap += dt
+            self.covered_budget -= dt if covered else 0.0
+        else:
+            self.unexplained_gap += dt
+            self.coast_budget -= dt
+
+    def can_confirm(self, params: TrackParams) -> bool:
+        """Whether a tentative track meets the conditions of confirmation in this frame."""
+        hits = self.hits - self.all_misses >= params.confirm_hits
+        old = self.age > params.confirm_seconds - TIME_TOLERANCE
+        convincing = self.confirm_at_birth or (hits and old and self.score >= params.confirm_score)
+        return convincing and not self.id and not self.misses
+
+    def is_expired(self, params: TrackParams) -> bool:
+        """Whether it has had no detection for too long."""
+        if self.id:
+            unexplained = self.unexplained_gap > params.max_coast + TIME_TOLERANCE
+            return unexplained or self.hidden_gap > params.max_hidden + TIME_TOLERANCE
+        return self.time_since_update > params.tentative_coast + TIME_TOLERANCE
 
 
 class Tracker:
@@ -292,7 +392,8 @@ class Tracker:
         hidden = hidden_edges(boxes, predicted, rows, in_front)
         measured = Measurements.from_boxes(boxes, frame, is_merged, self._lens, covered[rows], hidden, unsure)
         measured = measured._replace(growth=self._growth(tracks, measured, before[rows], frame, gray))
-        states = self._smoother.correct(self._states.take(rows), tracks, measured, dt)
+        gaps = np.array([track.last_gap for track in tracks])
+        states = self._smoother.correct(self._states.take(rows), gaps, measured, dt)
         states = update_distances(states, measured, self.camera, dt, self.params.measurement_correlation_time)
         self._states = self._states.put(rows, states)
         return unassigned
