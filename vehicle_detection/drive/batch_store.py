@@ -360,9 +360,9 @@ def _parse(key: str, data: bytes) -> dict[str, Any] | None:
             return None
     for name, kinds in _VALUES.items():
         value = record.get(name)
-        if value is not None and not isinstance(value, kinds):
-            return None
-        if kinds is not str and not 0 <= (value or 0) < _MAX_NUMBER:
+        if value is None:
+            continue
+        if not isinstance(value, kinds) or (kinds is not str and not 0 <= value < _MAX_NUMBER):
             return None
     record["key"], record["outputs"] = key, outputs
     return record
@@ -407,7 +407,8 @@ def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
     for record in iterate_records(open_store(out)):
         counts[record["status"]] += 1
         if record["status"] == DONE:
-            sums.update({name: record.get(name) or 0 for name in _NUMBERS})
+            for name in _NUMBERS:
+                sums[name] += record.get(name) or 0
         else:
             messages[record["sources"][0]["uri"]] = record.get("message") or ""
     return BatchStatus(
