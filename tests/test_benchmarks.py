@@ -1,5 +1,6 @@
 """The fast parts of the benchmarks, on small rendered images."""
 
+import copy
 import json
 import sys
 
@@ -50,13 +51,13 @@ def classifier():
     return VehicleClassifier(params, (Template(mean, scale, rng.normal(0, 0.01, params.length), 0.0),))
 
 
-def course_search(frame, classifier):
+@pytest.fixture(scope="module")
+def course(frame, classifier):
     scaler, svc = (step for _, step in to_pipeline(classifier).steps[-2:])
     return search_course(frame, SEARCH.place(frame.shape), scaler, svc)
 
 
-def test_course_and_search_agree(frame, classifier):
-    course = course_search(frame, classifier)
+def test_course_and_search_agree(frame, classifier, course):
     assert 0 < (course.scores > 0).sum() < len(course.scores)
     with classifier.open_search(1) as ours:
         agreement = check_agreement(frame, ours, SEARCH, course)
@@ -66,8 +67,8 @@ def test_course_and_search_agree(frame, classifier):
     assert agreement.disputed == 0
 
 
-def test_the_comparison_detects_wrong_hits_and_boxes(frame, classifier):
-    course = course_search(frame, classifier)
+def test_the_comparison_detects_wrong_hits_and_boxes(frame, classifier, course):
+    course = copy.deepcopy(course)
     best = int(course.scores.argmax())
     with classifier.open_search(1) as ours:
         course.scores[best] -= 2 * course.scores[best]
@@ -163,7 +164,7 @@ def test_a_bound_batch_uses_one_cpu(tmp_path):
 
 def test_drives_are_scored_over_seeds(tmp_path, monkeypatch):
     small = {"shape": (540, 960), "scenario": "closing"}
-    monkeypatch.setattr(_drives, "FRAMES", 15)
+    monkeypatch.setattr(_drives, "FRAMES", 9)
     monkeypatch.setattr(_drives, "CASES", {"closing": small})
     monkeypatch.setattr(_drives, "EMPTY_CASES", {"empty": {"shape": (270, 480), "scenario": "empty"}})
     rows = {row.what: row for row in _drives.run(Context(tmp_path, seeds=2))}
