@@ -392,13 +392,6 @@ def test_bad_options_are_refused(options, message):
         VehicleDetector(**options)
 
 
-@pytest.mark.parametrize("name", ["search_params", "region_params", "track_params", "camera"])
-@pytest.mark.parametrize("value", ["default", 5, {}])
-def test_parameters_of_another_kind_are_refused(name, value):
-    with pytest.raises(InvalidInputError, match=rf"^{name} must be a [\w ]+,.* got .*; omit it"):
-        make(**{name: value})
-
-
 def test_heat_thresholds_depend_on_the_model():
     thresholds = {
         model: Detector(model, region_params=HeatParams()).heat_params.threshold

@@ -58,11 +58,6 @@ BAD_TRAINING = {
     "--vehicles small.zip {others} -o small.zip": "--output small.zip is also --vehicles small.zip;",
     "{vehicles} {others} {model} --report m.safetensors": "--report .+ is also --output .+;",
     "{vehicles} {others} {model} --card none/card.md": "--card needs an existing folder",
-    "{vehicles} {others} {model} --features hog": "--features must be one of 'luv-2384'",
-    "{vehicles} {others} {model} --compare sift": "--compare must be one of 'luv-2384', .* got 'sift'",
-    "{vehicles} {others} {model} --split half": "--split must be one of 'random', 'sequences'",
-    "{vehicles} {others} {model} --C 0": "--C must be a number, greater than 0",
-    "{vehicles} {others} {model} --seed -1": "--seed must be an integer from 0",
 }
 
 

@@ -118,13 +118,10 @@ def test_tune_refuses_bad_input(patches, material, tmp_path, monkeypatch):
     cases = {
         "{patches} -o t.csv --grid color=LAB": "--grid has the unknown option 'color'",
         "{patches} -o t.csv --grid orient": "--grid must look like 'orient=8,9",
-        "{patches} {grid} -o t.csv --halving --finalists 0": "--finalists must be an integer at least 1",
         "{patches} {grid} -o t.csv --model highway": "--model needs a --grid of a search",
         "{grid} -o t.csv": "--grid of features needs patches to train on; give --vehicles and",
         "--grid scales=1 -o t.csv": "--grid of a search needs labelled frames",
         "--grid scales=a+b -o t.csv {frames}": "--grid must join scales by +",
-        "--grid overlap=1 -o t.csv {frames}": "--grid must be a number, at least 0 and at most 0.99",
-        "{patches} {grid} -o t.csv --split half": "--split must be one of 'sequences'",
         "{patches} {grid} -o t.xls": "--output must end in .csv or .jsonl or .parquet",
         "{patches} {grid} -o none/t.csv": "--output needs an existing folder",
         "{patches} {grid} -o t.csv --plot p.jpg": "--plot must end in .png or .svg",

@@ -103,7 +103,7 @@ def crowds(draw):
 
 
 @given(trial=trials() | crowds())
-@settings(max_examples=30)
+@settings(max_examples=20)
 def test_track_scores_equal_those_of_motmetrics(trial):
     found, labels = trial
     accumulator = motmetrics.MOTAccumulator(auto_id=True)

@@ -930,7 +930,7 @@ frame_strategy = st.tuples(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(st.lists(frame_strategy, min_size=1, max_size=25))
 def test_arbitrary_detections_give_valid_tracks(frames):
     params = TrackParams(confirm_hits=1, confirm_seconds=0.0, confirm_score=-1.0)

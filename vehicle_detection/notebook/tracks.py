@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +14,6 @@ from vehicle_detection.notebook import style
 from vehicle_detection.notebook.style import COLORS, LINESTYLES, YELLOW, FigureLike
 from vehicle_detection.tables import TrackTable
 from vehicle_detection.tracking import FrameResult
-
-if TYPE_CHECKING:
-    pass
-
 
 _LABELS = (
     "center of the box, x (px)",
