@@ -8,7 +8,7 @@ from vehicle_detection.images import write_image
 from vehicle_detection.scenes import render_drive
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def material(tmp_path_factory):
     """Return a folder with a clip and its labels, a picture, patches and damaged copies."""
     folder = tmp_path_factory.mktemp("material")
