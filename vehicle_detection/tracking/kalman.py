@@ -167,7 +167,7 @@ class KalmanSmoother:
         return states._replace(mean=mean, cov=cov * scale[:, :, None] * scale[:, None, :])
 
     def correct(self, states: KalmanStates, gaps: Floats, measured: Measurements, dt: float) -> KalmanStates:
-        """Correct the boxes of tracks by a measurement each, before which they had none for `gaps` seconds."""
+        """Correct the boxes of tracks by a measurement each, after `gaps` seconds without one."""
         params, mean, boxes = self._params, states.mean, measured.boxes
         # A truncated edge says only that the vehicle reaches the border: no correction if it is predicted to.
         is_outside = (boxes_from_states(mean) - boxes) * OUTWARD >= 0

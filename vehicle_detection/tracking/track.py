@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time as clock
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
