@@ -13,7 +13,7 @@ import re
 import textwrap
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import typer
 from typer import Option
@@ -118,15 +118,15 @@ def _print_system_errors() -> Iterator[None]:
     raise typer.Exit(BAD_INPUT)
 
 
-# What typer does by pydantic, whose import takes a tenth of a second.
-_CONVERTERS: dict[Any, Callable[[Any], Any]] = {
-    str: str, int: int, float: float, Path: Path, list[str]: list,
-}  # fmt: skip
+# What typer does by pydantic, whose import takes a tenth of a second, a sixth of `detect` of an image.
+_CONVERTERS: dict[Any, Callable[[Any], Any]] = {str: str, int: int, float: float, Path: Path}
+_CONVERTERS |= {kind | None: convert for kind, convert in _CONVERTERS.items()} | {list[str]: list}
 
 
-def _process_value(param: Any, by_typer: Callable[..., Any], ctx: Any, value: Any) -> Any:
+def _process_value(
+    param: Any, convert: Callable[[Any], Any] | None, by_typer: Callable[..., Any], ctx: Any, value: Any
+) -> Any:
     """Convert the value of a parameter; typer does it where the conversion fails, to report that."""
-    convert = _CONVERTERS.get(param.type_descriptor.annotation)
     if value is None and not param.required:
         converted: Any = () if param.multiple or param.nargs == -1 else None
     elif convert is None or (param.required and not value):
@@ -139,19 +139,19 @@ def _process_value(param: Any, by_typer: Callable[..., Any], ctx: Any, value: An
     return converted if param.callback is None else param.callback(ctx, param, converted)
 
 
-def _convert_quickly(params: list[Any]) -> None:
-    for param in params:
-        if hasattr(param, "type_descriptor"):  # the attribute is not public
-            param.process_value = functools.partial(
-                _process_value, param, type(param).process_value.__get__(param)
-            )
+def _convert_quickly(command: Any, ctx: Any) -> None:
+    """Convert the values of a command's parameters by the types of its function."""
+    hints = get_type_hints(command.callback)
+    for param in command.get_params(ctx):
+        convert, by_typer = _CONVERTERS.get(hints.get(param.name)), type(param).process_value.__get__(param)
+        param.process_value = functools.partial(_process_value, param, convert, by_typer)
 
 
 class _Command(TyperCommand):
     """A command whose help lists the options of each panel under its name."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
-        _convert_quickly(self.get_params(ctx))
+        _convert_quickly(self, ctx)
         return super().parse_args(ctx, args)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
@@ -172,7 +172,7 @@ class _Commands(TyperGroup):
     """Commands whose expected errors become one line on standard error."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
-        _convert_quickly(self.get_params(ctx))
+        _convert_quickly(self, ctx)
         return super().parse_args(ctx, args)
 
     def make_context(self, *args: Any, **options: Any) -> Any:
