@@ -42,8 +42,9 @@ def raise_on_signals() -> Iterator[None]:
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         nonlocal last
-        common = sys.modules.get("vehicle_detection._common")  # importing it takes tenths of a second
-        if common is not None and common.postpone(number, frame):
+        # Importing it takes tenths of a second; while it is imported, it has no such function.
+        postpone = getattr(sys.modules.get("vehicle_detection._common.signals"), "postpone", None)
+        if postpone is not None and postpone(number, frame):
             return
         previous, last = last, time.monotonic()
         if last - previous > _CLEANUP_SECONDS:

@@ -17,7 +17,10 @@ STRIDES = (8, 16, 32, 64)
 CENTER, SCALE = 115.0, 64.0
 """Normalization of gray levels: ``(value - CENTER) / SCALE``; the center is also the padding's gray."""
 
-_CHANNELS = (16, 32, 64, 96, 128, 128)  # at strides 2 to 64
+_FIRST = 16  # channels at stride 2
+_CHANNELS = (32, 64, 96, 128, 128)  # at strides 4 to 64
+_HIDDEN = (16, 32, 48, 64, 128)  # of the residual blocks there
+_BLOCKS = (1, 1, 2, 2, 1)  # number of those blocks
 _PYRAMID = 64
 
 
@@ -55,17 +58,16 @@ class Network(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        c = _CHANNELS
-        self.stem = nn.Sequential(_conv(3, c[0], 2), _conv(c[0], c[1], 2), Residual(c[1], 16))
-        self.stages = nn.ModuleList(
-            [
-                nn.Sequential(_conv(c[1], c[2], 2), Residual(c[2], 48)),
-                nn.Sequential(_conv(c[2], c[3], 2), Residual(c[3], c[3]), Residual(c[3], c[3])),
-                nn.Sequential(_conv(c[3], c[4], 2), Residual(c[4], c[4]), Residual(c[4], c[4])),
-                nn.Sequential(_conv(c[4], c[5], 2), Residual(c[5], c[5])),
-            ]
+        stem, *stages = (
+            [Residual(channels, hidden) for _ in range(count)]
+            for channels, hidden, count in zip(_CHANNELS, _HIDDEN, _BLOCKS)
         )
-        self.lateral = nn.ModuleList([nn.Conv2d(channels, _PYRAMID, 1) for channels in c[2:]])
+        self.stem = nn.Sequential(_conv(3, _FIRST, 2), _conv(_FIRST, _CHANNELS[0], 2), *stem)
+        self.stages = nn.ModuleList(
+            nn.Sequential(_conv(inputs, outputs, 2), *blocks)
+            for inputs, outputs, blocks in zip(_CHANNELS, _CHANNELS[1:], stages)
+        )
+        self.lateral = nn.ModuleList([nn.Conv2d(channels, _PYRAMID, 1) for channels in _CHANNELS[1:]])
         self.smooth = nn.ModuleList([_separable(_PYRAMID) for _ in range(3)])
         self.head = nn.Sequential(_separable(_PYRAMID), _separable(_PYRAMID))
         self.output = nn.Conv2d(_PYRAMID, 5, 1)

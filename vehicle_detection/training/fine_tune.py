@@ -83,7 +83,7 @@ def fine_tune_network(
     steps
         Steps of 8 samples; None takes 5 for each frame, 200 to 1200. A step takes 0.6 s on two cores.
     random_state, jobs
-        Seed of the samples; threads, and processes that draw samples on CUDA.
+        Seed of the samples; threads.
     device
         ``"cpu"`` or ``"cuda"``; None takes CUDA where PyTorch offers it. The same seed on the same kind of
         device, with the same number of threads, gives the same network.

@@ -6,7 +6,6 @@ import contextlib
 import copy
 import logging
 import math
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -15,14 +14,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset
 
-from vehicle_detection._common import atomic_write, resolve_jobs, single_threaded_opencv
+from vehicle_detection._common import atomic_write, resolve_jobs
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.training.architecture import Network, cell_centers
 from vehicle_detection.training.frames import TrainingFrame
 from vehicle_detection.training.loss import Targets, detection_loss
-from vehicle_detection.training.samples import Sample, Sampler
+from vehicle_detection.training.samples import Sampler
 
 log = logging.getLogger(__name__)
 
@@ -60,9 +58,9 @@ def train_network(
 ) -> Network:
     """Train a network on frames in memory, from `initial` or from random weights.
 
-    `jobs` processes draw samples, and as many threads compute on the processor. An interrupted training
-    continues from its `checkpoint`. `on_step` is called with the number of finished steps and a line of text,
-    now and then. Returns the moving average of the weights, on the processor, for evaluation.
+    `jobs` threads compute on the processor. An interrupted training continues from its `checkpoint`.
+    `on_step` is called with the number of finished steps and a line of text, now and then. Returns the moving
+    average of the weights, on the processor, for evaluation.
     """
     if not any(len(frame.boxes) for frame in frames):
         raise InvalidInputError("frames must show at least one vehicle; label some, and pass their labels")
@@ -76,25 +74,15 @@ def train_network(
         state.load(checkpoint)
     report = on_step or (lambda _, line: log.info(line))
     centers, _ = cell_centers(training.size[1], training.size[0], place)
-    dataset = _Samples(Sampler(frames, training.size), training, state.step)
-    # On a processor, drawing samples takes a sixth of the time; a process for it would disturb two threads.
-    workers = max(1, jobs - 1) if place.type == "cuda" else int(jobs > 2)
-    batches = DataLoader(
-        dataset,
-        batch_size=None,
-        num_workers=workers,
-        pin_memory=place.type == "cuda",
-        generator=torch.Generator(),  # not the global one
-        prefetch_factor=4 if workers else None,
-        multiprocessing_context="fork" if workers and hasattr(os, "fork") else None,
-    )
+    sampler = Sampler(frames, training.size, place)
     first, start, report_is_due = state.step, time.monotonic(), _timer(_REPORT_SECONDS)
     checkpoint_is_due = _timer(_CHECKPOINT_SECONDS)
-    # Forked processes cannot use the threads of OpenCV.
-    with single_threaded_opencv(), _torch_settings(jobs):
-        for images, boxes, usable, ignored in batches:
-            targets = Targets(*(each.to(place, non_blocking=True) for each in (boxes, usable, ignored)))
-            losses = state.update(images.to(place, non_blocking=True), targets, centers)
+    with _torch_settings(jobs):
+        while state.step < training.steps:
+            images, targets = sampler.draw(
+                np.random.default_rng([training.random_state, state.step]), training.batch
+            )
+            losses = state.update(images, targets, centers)
             if report_is_due() or state.step == training.steps:
                 score, box = (each.item() for each in losses)
                 passed = time.monotonic() - start
@@ -137,35 +125,6 @@ def _torch_settings(threads: int) -> Iterator[None]:
     finally:
         torch.set_num_threads(before[0])
         cudnn.deterministic = before[1]
-
-
-class _Samples(Dataset[tuple[Tensor, ...]]):
-    """The batches of a training; each depends on the seed and its number alone."""
-
-    def __init__(self, sampler: Sampler, training: NetworkTraining, start: int) -> None:
-        self._sampler, self._training, self._start = sampler, training, start
-
-    def __len__(self) -> int:
-        return self._training.steps - self._start
-
-    def __getitem__(self, index: int) -> tuple[Tensor, ...]:
-        first = (self._start + index) * self._training.batch
-        numbers = range(first, first + self._training.batch)
-        seed = self._training.random_state
-        samples = [self._sampler.draw(np.random.default_rng([seed, number])) for number in numbers]
-        return collate(samples)
-
-
-def collate(samples: Sequence[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Stack images; pad boxes, with which of them exist, and ignored boxes to the same number."""
-    n, most = len(samples), max(1, *(len(sample.boxes) for sample in samples))
-    boxes, usable = np.zeros((n, most, 4), np.float32), np.zeros((n, most), np.bool_)
-    ignored = np.zeros((n, max(1, *(len(sample.ignored) for sample in samples)), 4), np.float32)
-    for row, sample in enumerate(samples):
-        boxes[row, : len(sample.boxes)], usable[row, : len(sample.boxes)] = sample.boxes, True
-        ignored[row, : len(sample.ignored)] = sample.ignored
-    images = np.stack([sample.image for sample in samples])
-    return tuple(torch.from_numpy(each) for each in (images, boxes, usable, ignored))
 
 
 class _State:
