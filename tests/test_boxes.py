@@ -229,6 +229,7 @@ def test_detections_of_supervision_are_converted():
         (StandIn(TWO, [0.5, 0.5], [2, 7]), {"class_ids": 2}, "class_ids must be a sequence of integers"),
         (StandIn(TWO), {"score": (1, 1)}, r"score\[1\] must be a number, greater than 1"),
         (StandIn(TWO), {"score": (0, 1), "threshold": 0.5}, "threshold must be omitted"),
+        (StandIn(TWO), {"score": "logit", "threshold": "0"}, "threshold must be a number"),
     ],
 )
 def test_invalid_detections_of_supervision_are_rejected(given_, options, message):
