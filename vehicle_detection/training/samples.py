@@ -86,8 +86,8 @@ class Sampler:
         boxes = np.concatenate([boxes, added], axis=1)
         image = self._warp(rows, views)
         for i in range(_COVERS):
-            image = torch.where(self._mask(covers[:, i]), self._random_colors(count, rng), image)
-        image = torch.where(self._mask(parts), image.roll(1, 0), image)
+            image = self._paint(image, covers[:, i], self._random_colors(count, rng))
+        image = self._paint(image, parts, image.roll(1, 0))
         image = self._change_light(image, rng).round_().clamp_(0, 255).byte().permute(0, 2, 3, 1)
         (vehicles, exists), (ignored, _) = (_compact(boxes, kinds == kind) for kind in (VEHICLE, IGNORED))
         return image, Targets(self._tensor(vehicles), self._tensor(exists), self._tensor(ignored))
@@ -150,13 +150,16 @@ class Sampler:
             samples.append(F.grid_sample(image, grid[None], align_corners=False))
         return torch.cat(samples).add_(CENTER)
 
-    def _mask(self, rectangles: Floats) -> Tensor:
-        """Pixels ``(n, 1, height, width)`` in one rectangle of each sample."""
-        width, height = self._size
-        x1, y1, x2, y2 = self._tensor(rectangles).round()[:, :, None, None, None].unbind(1)
-        x = torch.arange(width, device=self._device)
-        y = torch.arange(height, device=self._device)[:, None]
-        return (x >= x1) & (x < x2) & (y >= y1) & (y < y2)
+    def _paint(self, image: Tensor, rectangles: Floats, source: Tensor) -> Tensor:
+        """Copy a rectangle of each sample from other images or colors; empty ones copy nothing."""
+        chosen = np.flatnonzero((rectangles[:, 2:] > rectangles[:, :2]).all(axis=1))
+        x1, y1, x2, y2 = self._tensor(rectangles[chosen]).round()[:, :, None, None, None].unbind(1)
+        x = torch.arange(self._size[0], device=self._device)
+        y = torch.arange(self._size[1], device=self._device)[:, None]
+        inside = (x >= x1) & (x < x2) & (y >= y1) & (y < y2)
+        rows = torch.from_numpy(chosen).to(self._device)
+        image[rows] = torch.where(inside, source[rows], image[rows])
+        return image
 
     def _change_light(self, image: Tensor, rng: Rng) -> Tensor:
         """Change gamma, contrast, brightness, saturation, color cast, fog, sharpness, noise, compression."""
