@@ -333,6 +333,34 @@ def test_searched_frames_are_held_back_for_tracks_that_are_confirmed_later(clip,
     assert shown == ([0] * 5 + [1] * 15 if live else [1] * 20)
 
 
+@pytest.mark.parametrize("live", [False, True])
+def test_a_live_frame_is_taken_when_its_search_can_begin(clip, monkeypatch, live):
+    """While two searches run; until then, newer frames may take its place."""
+    frames, during, released = [], [], threading.Event()
+
+    class Counted(engine.SceneCuts):
+        def update(self, frame):
+            frames.append(frame)
+            return super().update(frame)
+
+    class Blocked(StubDetector):
+        def search(self, frame):
+            released.wait(60)
+            return super().search(frame)
+
+    def release():
+        during.append(len(frames))
+        released.set()
+
+    monkeypatch.setattr(FrameSource, "live", live)
+    monkeypatch.setattr(engine, "SceneCuts", Counted)
+    timer = threading.Timer(1.0, release)
+    timer.start()
+    with track(clip, Blocked(), jobs=2) as results:
+        assert len(list(results)) == 20
+    assert during[0] <= 2 if live else during[0] > 2
+
+
 def test_a_run_that_ends_before_its_first_frame_keeps_the_target(clip, tmp_path):
     target = tmp_path / "out.mp4"
     target.write_bytes(b"old")

@@ -14,7 +14,7 @@ import threading
 import time
 from collections import defaultdict, deque
 from collections.abc import Generator, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Protocol, Self
@@ -253,6 +253,7 @@ class _Pipeline:
     def _decode(self, reader: Reader) -> None:
         """Submit the frames to search to the pool, and queue all of them in order."""
         cuts, skipped, expected = SceneCuts(), 0, None
+        running: deque[Future[Any]] = deque(maxlen=self._plan.jobs)  # the last searches
         sample = SceneCuts.sample_size(self._plan.source.info.shape)
         for index, moment, frame in reader.decoded():
             if self.stopped:
@@ -265,11 +266,14 @@ class _Pipeline:
                 if self._plan.reduction == 1:  # once for the search and for drawing
                     frame = DecodedFrame(frame.rgb())
                 search, skipped = self._pool.submit(self._search, frame), 0
+                running.append(search)
             kept = frame if self._plan.frames else None
             self._queue.put(_QueuedFrame(moment, kept, cut, search, dropped))
             del frame, kept
             self.dropped += dropped
             expected = index + 1
+            if self._plan.source.live and skipped + 1 >= self._plan.interval:
+                _wait_for_one(running)
 
     def _search(self, frame: DecodedFrame) -> tuple[Any, float]:
         start, factor = time.perf_counter(), self._plan.reduction
@@ -327,6 +331,12 @@ class _Pipeline:
                     self.stages[name] += seconds
             frame, item.frame = item.frame, None
             yield result if frame is None else replace(result, frame=frame.rgb())
+
+
+def _wait_for_one(running: deque[Future[Any]]) -> None:
+    """Wait until not all of the last searches run, so that the next one begins with the newest frame."""
+    while len(running) == running.maxlen and not any(search.done() for search in running):
+        wait(running, timeout=0.1, return_when=FIRST_COMPLETED)  # which does not notice cancelled ones
 
 
 class TrackRun(Closing):
