@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from vehicle_detection import Camera, Detections, Tracker
 from vehicle_detection.tracking import small_gray
-from vehicle_detection.tracking.growth import measure_growth
+from vehicle_detection.tracking.pixels import measure_growth
 
 SHAPE = (360, 640)
 CAMERA = Camera.dashcam(fov=60, height_m=1.4, horizon=0.5).for_shape(SHAPE)

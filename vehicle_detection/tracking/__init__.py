@@ -1,7 +1,6 @@
 """Tracking: detections of single frames in, vehicles with constant identities out."""
 
 from vehicle_detection.tracking.distance import measure_distances
-from vehicle_detection.tracking.growth import small_gray
 from vehicle_detection.tracking.horizon import HorizonEstimate, estimate_horizon
 from vehicle_detection.tracking.interpolation import (
     backfill_results,
@@ -9,7 +8,7 @@ from vehicle_detection.tracking.interpolation import (
     search_delay,
     search_interval,
 )
-from vehicle_detection.tracking.scene_cuts import SceneCuts
+from vehicle_detection.tracking.pixels import SceneCuts, small_gray
 from vehicle_detection.tracking.track import (
     TRACK_VALUES,
     UNKNOWN_LABEL,

@@ -39,7 +39,6 @@ from vehicle_detection.tracking.distance import (
     predict_distances,
     update_distances,
 )
-from vehicle_detection.tracking.growth import Gray, measure_growth
 from vehicle_detection.tracking.horizon import HorizonFilter
 from vehicle_detection.tracking.kalman import (
     OUTWARD,
@@ -49,6 +48,7 @@ from vehicle_detection.tracking.kalman import (
     coasted_distance,
     exit_times,
 )
+from vehicle_detection.tracking.pixels import Gray, measure_growth
 from vehicle_detection.tracking.track import TIME_TOLERANCE, UNKNOWN_LABEL, Track, TrackParams
 
 # Visible fraction of a box below which its vehicle leaves the frame if it moves outwards, and below which it
