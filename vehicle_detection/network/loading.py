@@ -104,7 +104,7 @@ def _own_model(graph: bytes, facts: GraphFacts) -> NetworkModel:
         NetworkParams(input_size=size)
         scores: Any = {name: float(params[name]) for name in ("slope", "offset", "threshold", "nms_iou")}
         side, share, top = map(float, params.get("margins", (0, 0, 0)))
-        if not all(0 <= margin < 100 for margin in (side, share, top)):
+        if not (0 <= side < 100 and -1 < share < 1 and 0 <= top < 100):
             raise ValueError(f"margins {params['margins']}")
         is_image = image.dtype == "uint8" and len(image.shape) == 4
         if not is_image or len(boxes.shape) != 3 or boxes.shape[1] not in (5, None):
