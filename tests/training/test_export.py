@@ -111,7 +111,7 @@ def test_files_of_other_kinds_are_refused(files):
     cases = {
         "is no complete ONNX file; train": content[:1000],
         r"architecture \('stem.0.0'\); train from": change(content, drop),
-        "not a network of this library's architecture": change(content, rename),
+        "not a network of this version's architecture": change(content, rename),
         "values that are not finite": change(content, spoil),
         r"output has the shape \(6, 64, 1, 1\), expected \(5, 64, 1, 1\)": change(content, widen),
     }

@@ -90,3 +90,11 @@ def test_frames_without_vehicles_are_refused(frames):
     empty = [dataclasses.replace(frame, boxes=np.zeros((0, 4))) for frame in frames]
     with pytest.raises(InvalidInputError, match="frames must show at least one vehicle; label some"):
         train(empty)
+
+
+@pytest.mark.parametrize("size", [(100, 64), (64, 0)])
+def test_sizes_that_are_no_multiples_of_32_are_refused(frames, size):
+    with pytest.raises(
+        InvalidInputError, match=r"size must be multiples of 32, got \(.+; choose \(640, 384\)"
+    ):
+        train(frames, dataclasses.replace(TRAINING, size=size))

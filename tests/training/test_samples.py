@@ -35,6 +35,77 @@ def test_boxes_lie_inside_the_sample_and_have_a_size(seed):
         assert (boxes[..., 2:] > boxes[..., :2]).all()
 
 
+@pytest.mark.parametrize("shape", [(33, 33), (1, 200), (200, 1), (1, 1)])
+def test_tiny_frames_are_enlarged(shape):
+    tiny = frame(boxes=[(0, 0, shape[1], shape[0])], shape=shape)
+    images, _ = sampler(tiny, frame(boxes=())).draw(np.random.default_rng(0), 8)
+    assert images.shape == (8, SIZE[1], SIZE[0], 3)
+
+
+@pytest.mark.parametrize("boxes", [[], [(-20, -20, 30, 30), (190, 110, 230, 140), (50, 20, 50, 60)]])
+@pytest.mark.parametrize("ignored", [[], [(100, 10, 190, 60)]])
+def test_frames_without_a_vehicle_that_counts(boxes, ignored):
+    _, targets = sampler(frame(boxes, ignored)).draw(np.random.default_rng(0), 4)
+    for each in targets:
+        assert each.isfinite().all()
+    assert bool(boxes) or not targets.usable.any()
+    assert bool(boxes) or bool(ignored) == bool(targets.ignored.any())
+
+
+def test_the_layout_of_the_pixels_in_memory_does_not_matter():
+    plain = frame()
+    reversed_twice = np.ascontiguousarray(plain.image[..., ::-1])[..., ::-1]
+    fixed = plain.image.copy()
+    fixed.flags.writeable = False
+    expected, _ = sampler(plain).draw(np.random.default_rng(0), 3)
+    for image in reversed_twice, np.asfortranarray(plain.image), fixed:
+        images, _ = sampler(dataclasses.replace(plain, image=image)).draw(np.random.default_rng(0), 3)
+        np.testing.assert_array_equal(images, expected)
+
+
+@pytest.mark.parametrize("change", [Sampler._blur, Sampler._reduce])
+def test_blurred_and_reduced_images_keep_their_borders_and_do_not_move(change):
+    ramp = torch.linspace(0, 255, 256).expand(2, 3, 96, 256)
+    for seed in range(20):
+        changed = change(sampler(frame()), ramp.contiguous(), np.random.default_rng(seed))
+        inner = slice(8, -8)
+        assert (changed - ramp)[..., inner].abs().max() < 0.2
+        assert (changed - ramp).abs().max() < 2.5
+
+
+def test_a_sample_is_not_mixed_with_itself():
+    draw = sampler(frame()).draw
+    assert max(int(draw(np.random.default_rng(seed), 1)[1].usable.sum()) for seed in range(40)) == 1
+
+
+@pytest.mark.parametrize(
+    ("shift", "cover", "part", "kept", "ignored"),
+    [
+        (0, (0.0, 0.4), (0.0, 0.0), [0, 100], None),
+        (0, (0.0, 0.4), (0.6, 1.0), [60, 100], [0, 100]),  # of 100 px, two rectangles hide 80
+        (-50, (0.0, 0.0), (0.5, 1.0), [0, 50], [25, 50]),  # half is in view, and half of that in the part
+    ],
+)
+def test_vehicles_that_are_hidden_twice_are_judged_by_what_remains(
+    monkeypatch, shift, cover, part, kept, ignored
+):
+    def rectangles(boxes, of):
+        x1, y1, x2, y2 = np.moveaxis(boxes[:, 0], -1, 0)
+        sides = [x1 + of[0] * (x2 - x1), y1, x1 + of[1] * (x2 - x1), y2]
+        return np.stack(sides, -1) * (of[1] > of[0])
+
+    view = np.array([[1.0, 0.0, shift], [0.0, 1.0, 0.0]])
+    monkeypatch.setattr(Sampler, "_random_views", lambda self, rows, rng: np.tile(view, (len(rows), 1, 1)))
+    covers = lambda boxes, *_: rectangles(boxes, cover)[:, None] * np.array([1, 0, 0])[:, None]  # noqa: E731
+    monkeypatch.setattr(samples, "_random_covers", covers)
+    monkeypatch.setattr(samples, "_random_parts", lambda boxes, *_: rectangles(boxes, part))
+    _, targets = sampler(frame(boxes=[(0, 20, 100, 60)])).draw(np.random.default_rng(0), 2)
+    assert targets.boxes[targets.usable][:, ::2].tolist() == [kept] * 2
+    assert targets.ignored.any() == (ignored is not None)
+    if ignored is not None:
+        assert targets.ignored[..., ::2].tolist() == [[ignored]] * 2
+
+
 def test_samples_depend_on_the_seed_alone():
     draw = sampler(frame(), frame(boxes=())).draw
     (one, boxes), (again, same), (other, _) = (draw(np.random.default_rng(seed), 4) for seed in (5, 5, 6))

@@ -64,6 +64,10 @@ def train_network(
     """
     if not any(len(frame.boxes) for frame in frames):
         raise InvalidInputError("frames must show at least one vehicle; label some, and pass their labels")
+    if any(side < 32 or side % 32 for side in training.size):
+        raise InvalidInputError(
+            f"size must be multiples of 32, got {training.size}; choose (640, 384), for example"
+        )
     place = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     jobs = resolve_jobs(jobs)
     with torch.random.fork_rng(devices=[]):

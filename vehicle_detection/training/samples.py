@@ -52,8 +52,11 @@ class Sampler:
 
     def __init__(self, frames: Sequence[TrainingFrame], size: tuple[int, int], device: torch.device) -> None:
         self._size, self._device = size, device
-        images = [torch.from_numpy(np.require(frame.image, requirements="W")) for frame in frames]
-        self._images = [image.to(device) for image in images]
+        images = [np.require(frame.image, requirements=("C", "W")) for frame in frames]
+        memory = torch.cuda.mem_get_info(device.index)[0] if device.type == "cuda" else 0
+        # Frames that leave too little memory for the training are copied to the device when they are drawn.
+        place = device if sum(image.nbytes for image in images) < 0.3 * memory else torch.device("cpu")
+        self._images = [torch.from_numpy(image).to(place) for image in images]
         self._sizes = np.array([frame.image.shape[1::-1] for frame in frames], np.float64)
         self._counts = np.array([len(frame.boxes) for frame in frames])
         # All boxes of a frame, vehicles first, padded to the same number.
@@ -74,15 +77,15 @@ class Sampler:
         rows = rng.choice(len(self._images), count, p=self.weights)
         views = self._random_views(rows, rng)
         boxes, visible = move_boxes(self._boxes[rows], views, self._size)
-        covers = _random_covers(boxes, visible, self._size, rng)
+        covers = _random_covers(boxes, (visible > 0) & (self._kinds[rows] == VEHICLE), self._size, rng)
         covered = sum(_overlaps(boxes, covers[:, [i]]) for i in range(_COVERS))
         kinds = _judge(self._kinds[rows], boxes, visible, covered)
-        # Each sample may show a part of the one before it.
+        # Each sample may show a part of the one before it, if that is another one.
         before, kinds_before = np.roll(boxes, 1, 0), np.roll(kinds, 1, 0)
         parts = _random_parts(before, kinds_before == VEHICLE, self._size, rng)
         added, inside = clip_boxes(before, parts)
-        kept = _judge(kinds, boxes, visible, _overlaps(boxes, parts[:, None]))
-        kinds = np.concatenate([kept, _judge(kinds_before, added, inside)], axis=1)
+        kept = _judge(kinds, boxes, visible, covered + _overlaps(boxes, parts[:, None]))
+        kinds = np.concatenate([kept, _judge(kinds_before, added, inside * np.roll(visible, 1, 0))], axis=1)
         boxes = np.concatenate([boxes, added], axis=1)
         image = self._warp(rows, views)
         for i in range(_COVERS):
@@ -143,7 +146,7 @@ class Sampler:
         zooms = np.sqrt(np.abs(np.linalg.det(views[:, :, :2])))
         samples = []
         for row, zoom, grid in zip(rows, zooms, grids):
-            image = self._images[row].permute(2, 0, 1)[None].float() - CENTER
+            image = self._images[row].to(self._device).permute(2, 0, 1)[None].float() - CENTER
             while zoom < 0.7 and min(image.shape[2:]) > 32:
                 half = image.shape[2] // 2, image.shape[3] // 2
                 image, zoom = F.interpolate(image, half, mode="area"), zoom * 2
@@ -200,14 +203,18 @@ class Sampler:
         for kernel, shape in (across, (1, _KERNEL)), (down, (_KERNEL, 1)):
             weights = self._tensor(kernel / kernel.sum(1, keepdims=True)).repeat_interleave(3, 0)
             weights = weights.reshape(3 * n, 1, *shape)
-            padding = shape[0] // 2, shape[1] // 2
-            flat = F.conv2d(image.reshape(1, 3 * n, *image.shape[2:]), weights, padding=padding, groups=3 * n)
-            image = flat.reshape(image.shape)
+            y, x = shape[0] // 2, shape[1] // 2
+            padded = F.pad(image, (x, x, y, y), mode="replicate").flatten(0, 1)[None]
+            image = F.conv2d(padded, weights, groups=3 * n).reshape(image.shape)
         return image
 
     def _reduce(self, image: Tensor, rng: Rng) -> Tensor:
         """Enlarge images from fewer pixels, as a camera of a lower resolution has."""
-        small = F.interpolate(image, scale_factor=rng.uniform(0.45, 0.85), mode="bilinear", antialias=True)
+        scale = rng.uniform(0.45, 0.85)
+        # A rounded size with the scale as it is would move pixels against their boxes.
+        small = F.interpolate(
+            image, scale_factor=scale, mode="bilinear", antialias=True, recompute_scale_factor=True
+        )
         return F.interpolate(small, image.shape[2:], mode="bilinear")
 
     def _add_noise(self, image: Tensor, rng: Rng) -> Tensor:
@@ -280,11 +287,11 @@ def _choose(boxes: Floats, exists: Bools, rng: Rng) -> tuple[Floats, Bools]:
     return boxes[np.arange(len(boxes)), chosen], np.asarray(exists.any(axis=1))
 
 
-def _random_covers(boxes: Floats, visible: Floats, size: tuple[int, int], rng: Rng) -> Floats:
+def _random_covers(boxes: Floats, shown: Bools, size: tuple[int, int], rng: Rng) -> Floats:
     """Draw up to three rectangles of each sample, often posts before vehicles; empty ones cover nothing."""
     covers = np.zeros((len(boxes), _COVERS, 4))
     for i in range(_COVERS):
-        box, exists = _choose(boxes, visible > 0, rng)
+        box, exists = _choose(boxes, shown, rng)
         n, is_post = len(box), (exists & (rng.random(len(box)) < 0.6))[:, None]
         side = np.maximum(box[:, 2:] - box[:, :2], 8) * rng.uniform((0.1, 0.3), (0.6, 1.6), (n, 2))
         side = np.where(is_post, side, rng.uniform(10, (110, 140), (n, 2)))
@@ -302,4 +309,4 @@ def _random_parts(boxes: Floats, exists: Bools, size: tuple[int, int], rng: Rng)
     side, center = rng.uniform(0.3, (0.7, 1.0), (n, 2)) * whole, rng.uniform(0, 1, (n, 2)) * whole
     free = np.concatenate([center - side / 2, center + side / 2], axis=1)
     part = np.where((found & (rng.random(n) < 0.5))[:, None], box + margin, free)
-    return np.asarray(np.clip(part, 0, (*size, *size)) * (rng.random((n, 1)) < 0.5))
+    return np.asarray(np.clip(part, 0, (*size, *size)) * ((rng.random((n, 1)) < 0.5) & (n > 1)))

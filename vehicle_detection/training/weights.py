@@ -35,8 +35,8 @@ def read_weights(graph: bytes, name: str) -> Network:
             network.scale.copy_(torch.tensor(_level_scales(constants)))
     except (LookupError, RuntimeError, ValueError) as error:
         raise ModelFileError(
-            f"{name} is not a network of this library's architecture ({error}); train from the model "
-            "'default', or from a file of train-frames"
+            f"{name} is not a network of this version's architecture ({error}); train from the model "
+            "'default', or from a file that train-frames of this version has written"
         ) from error
     network.eval()
     return network
