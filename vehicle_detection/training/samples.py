@@ -149,7 +149,8 @@ class Sampler:
             image = self._images[row].to(self._device).permute(2, 0, 1)[None].float() - CENTER
             while zoom < 0.7 and min(image.shape[2:]) > 32:
                 half = image.shape[2] // 2, image.shape[3] // 2
-                image, zoom = F.interpolate(image, half, mode="area"), zoom * 2
+                # Means of 2x2 pixels, for even sides; the mode "area" takes thrice as long for the same.
+                image, zoom = F.interpolate(image, half, mode="bilinear"), zoom * 2
             samples.append(F.grid_sample(image, grid[None], align_corners=False))
         return torch.cat(samples).add_(CENTER)
 
