@@ -32,6 +32,7 @@ from vehicle_detection._common import (
     flag,
     invalid,
     number,
+    parse_yaml,
     read_regular_file,
     suggest_keywords,
     write_text,
@@ -486,12 +487,7 @@ def _read_values(path: Path) -> dict[str, Any]:
 
 def _parse_yaml(text: str) -> Any:
     """Parse YAML of ROS, or of OpenCV, whose first line and tags are its own."""
-    import yaml
-
-    try:
-        return yaml.safe_load(re.sub(r"^%YAML:.*|!!opencv-matrix", "", text))
-    except yaml.YAMLError as error:
-        raise ValueError(" ".join(str(error).split())) from None
+    return parse_yaml(re.sub(r"^%YAML:.*|!!opencv-matrix", "", text))
 
 
 def _parse_xml(text: str) -> dict[str, Any]:
@@ -513,15 +509,15 @@ def _from_calibration(path: Path, values: dict[str, Any]) -> Camera:
         stated = values.get("distortion_coefficients") or {"data": []}
         distortion = np.array(stated["data"], np.float64).reshape(-1)
         fisheye = bool(int(values.get("fisheye_model") or 0))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InvalidInputError(
             f"camera file {path} must hold image_width, image_height, camera_matrix and perhaps "
             f"distortion_coefficients, as OpenCV and ROS write them ({error}); calibrate again"
         ) from None
     fisheye |= values.get("distortion_model") in ("equidistant", "fisheye")
-    (fx, _, cx), (_, fy, cy) = matrix[:2]
-    focal, finite = (fx + fy) / 2, np.isfinite(matrix).all() and np.isfinite(distortion).all()
-    if not (finite and 0.1 < focal / max(width, height) < 20 and 0.95 < fx / fy < 1.05):
+    (fx, _, cx), (_, fy, cy) = matrix[:2].tolist()
+    focal, finite = (fx + fy) / 2, all((np.abs(each) < 1e6).all() for each in (matrix, distortion))
+    if not (finite and 0.1 < focal / max(width, height) < 20 and 0.95 * fy < fx < 1.05 * fy):
         raise InvalidInputError(
             f"camera file {path} must have finite values, and focal lengths in pixels that fit the image and "
             f"agree within 5%; got {fx:g} and {fy:g}"
@@ -571,9 +567,9 @@ def _check_names(path: Path, values: dict[str, Any]) -> None:
         raise InvalidInputError(
             f"camera file {path} must be an object with the names {', '.join(sorted(known))}; got {extra}"
         )
-    for first, second in (("fov", "focal_px"), ("lens", "focal_px"), ("horizon", "horizon_px")):
-        if first in values and second in values:
-            raise InvalidInputError(f"camera file {path} must hold {first} or {second}, not both; drop one")
+    for pair in (("fov", "lens"), ("fov", "focal_px"), ("lens", "focal_px"), ("horizon", "horizon_px")):
+        if values.keys() >= {*pair}:
+            raise InvalidInputError(f"camera file {path} must hold {' or '.join(pair)}, not both; drop one")
 
 
 def lateral_offsets(boxes: NDArray[Any], shape: tuple[int, ...]) -> Floats:

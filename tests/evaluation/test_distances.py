@@ -48,6 +48,11 @@ def test_boxes_elsewhere_and_without_truth_do_not_count():
     assert "no matched box" in scores.summary()
 
 
+def test_vehicles_beside_the_camera_have_no_relative_error():
+    scores = evaluate_distances(table([1.0, 1.0], speed_mps=[-1, 1]), table([0.0, -3.0], speed_mps=[-1, 1]))
+    assert all(row.known == 0 for row in (*scores.distances.values(), scores.collision_times))
+
+
 def test_the_command_reports_them(tmp_path):
     for name, found in (("labels.csv", [20.0, 30.0]), ("tracks.csv", [21.0, 30.0])):
         rows = [f"0,{row + 1},{','.join(map(str, box))},{found[row]}" for row, box in enumerate(BOXES[:2])]

@@ -35,6 +35,7 @@ from vehicle_detection._common.text import (
     is_url,
     local_path,
     natural_key,
+    parse_yaml,
     pluralize,
     spreadsheet_text,
     stable_url,

@@ -1,8 +1,9 @@
-"""Text of counts, names and URLs: messages show URLs without their passwords and signatures."""
+"""Text of counts, names, URLs and YAML: messages show URLs without their passwords and signatures."""
 
 from __future__ import annotations
 
 import re
+from typing import Any
 from urllib.parse import unquote_plus
 
 _URL = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://")
@@ -33,6 +34,19 @@ _SIGNATURE = re.compile(
     r"x-(amz|goog)-.*|awsaccesskeyid|googleaccessid|expires|signature|key-pair-id|policy", re.IGNORECASE
 )
 _AZURE = re.compile(r"sig|s[eprstv]|srt|spr|sip|sdd|sk(oid|tid|[estv])|saoid|suoid|scid", re.IGNORECASE)
+
+
+def parse_yaml(text: str) -> Any:
+    """Parse the first document of YAML; a ValueError says what is wrong."""
+    import yaml
+
+    try:
+        return next(yaml.safe_load_all(text), None)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    # PyYAML raises the latter two for a wrong text after a tag, such as ``!!bool of``.
+    except (yaml.YAMLError, LookupError, AttributeError) as error:
+        raise ValueError(" ".join(str(error).split())) from None
 
 
 def is_url(text: str) -> bool:

@@ -120,6 +120,7 @@ def evaluate_distances(
     rows = match[match >= 0]
     found = predictions[match >= 0]
     true, true_speed = labels["distance_m"][rows], labels["speed_mps"][rows]
+    true[true <= 0] = np.nan  # beside or behind the camera: no relative error, no collision
     cut = labels["truncated"][rows] > 0
     relative = found["distance_m"] / true - 1
     std = found["distance_std_m"] / true

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vehicle_detection._common import Limit, check, describe, read_regular_file
+from vehicle_detection._common import Limit, check, describe, parse_yaml, read_regular_file
 from vehicle_detection.boxes import clip_boxes, logit
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import DatasetError, InvalidInputError
@@ -407,12 +407,10 @@ def _yolo_names(source: Path) -> dict[str, str]:
 
 def _yaml_names(file: Path) -> dict[str, str]:
     """Value of ``names``: a list, or a mapping from numbers."""
-    import yaml
-
     try:
-        data = next(yaml.safe_load_all(read_text(file)), None)  # of several documents, the first
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise DatasetError(f"{file} is not YAML text: {' '.join(str(error).split())}") from None
+        data = parse_yaml(read_text(file))
+    except ValueError as error:
+        raise DatasetError(f"{file} is not YAML text: {error}") from None
     names = data.get("names") if isinstance(data, dict) else None
     if not names or not isinstance(names, (list, dict)):
         raise DatasetError(f"{file} names no class; write them as names: [car, bus]")
