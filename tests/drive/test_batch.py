@@ -479,7 +479,9 @@ def test_a_log_that_cannot_be_written_does_not_end_a_batch(card, model, tmp_path
     assert len(records(tmp_path / "out")) == 3
 
 
-def test_a_dry_run_changes_nothing(card, model, tmp_path):
+def test_a_dry_run_changes_nothing(card, model, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "None").touch()  # no camera is given, hence no file of one
     out = tmp_path / "out"
     options = {"tracks_only": True, "dry_run": True}
     report = run(card, out, model, **options)

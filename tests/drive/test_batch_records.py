@@ -2,11 +2,13 @@
 
 import json
 import os
+from types import SimpleNamespace
 
 import pytest
 
 from vehicle_detection.drive import batch_status, batch_summary, batch_trip
 from vehicle_detection.drive.batch_store import open_store, write_record
+from vehicle_detection.drive.trips import Trip
 from vehicle_detection.errors import OutputError
 
 GOOD = {"status": "done", "sources": [{"uri": "a"}]}
@@ -94,3 +96,11 @@ def test_a_linked_folder_in_the_results_is_refused(tmp_path):
     store.write("tracks/a", b"x")
     assert (tmp_path / "real" / "tracks" / "a").read_bytes() == b"x"
     assert (tmp_path / "elsewhere" / "a.json").read_text() == "precious"
+
+
+def test_a_damaged_time_of_a_file_is_no_date(tmp_path, monkeypatch):
+    """As on a damaged card: beyond the year 9999."""
+    file = tmp_path / "video.mp4"
+    file.touch()
+    monkeypatch.setattr(batch_trip.os, "stat", lambda path: SimpleNamespace(st_size=1, st_mtime_ns=10**21))
+    assert batch_trip.plan_trip(Trip((file,), "front"), {}, {}, "")["date"] == "unknown"

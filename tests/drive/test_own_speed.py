@@ -179,6 +179,8 @@ class TestGpx:
             ("no XML", "a.gpx is no GPX file: .*; export it again"),
             ("", "a.gpx is no GPX file"),
             ("<gpx><trk>", "a.gpx is no GPX file"),
+            ('<?xml version="1.0" encoding="GB2312"?><gpx/>', "no GPX file: .*; export it again as UTF-8"),
+            ('<?xml version="1.0" encoding="none"?><gpx/>', "a.gpx is no GPX file"),
             (GPX.format(""), "a.gpx must have at least two track points with times, got 0"),
             (GPX.format('<trkpt lat="500" lon="x"><time>2024-05-01T08:00:00Z</time></trkpt>'
                         '<trkpt><time>2024-05-01T08:00:01</time></trkpt>'), "a.gpx has no speeds"),

@@ -201,7 +201,10 @@ def run_batch(
     check.flags(
         tracks_only=tracks_only, audio=audio, retry_failed=retry_failed, dry_run=dry_run, progress=progress
     )
-    _check_parts(executor, on_record)
+    if executor is not None and not hasattr(executor, "submit"):
+        raise invalid("executor", "be an executor of concurrent.futures", executor, "omit it")
+    if on_record is not None and not callable(on_record):
+        raise invalid("on_record", "be a function of a record", on_record)
     workers = available_cores() if jobs is None else check.integer(jobs, "jobs", low=1, high=1024)
     check.choice(preset, "preset", PRESETS)
     if executor is None and not dry_run:
@@ -225,9 +228,10 @@ def run_batch(
         bar = stack.enter_context(progress_bar(progress, len(pending), unit="trip", interactive_only=True))
         for record in stack.enter_context(contextlib.closing(_run(executor, pending, store))):
             bar.update()
-            counts[record["status"] if record["new"] else "skipped"] += 1
             if not record["new"]:
+                counts["skipped"] += 1
                 continue
+            counts[record["status"]] += 1
             counts["frames"] += record.get("frames", 0)
             if record["status"] != DONE:
                 messages[record["sources"][0]["uri"]] = record["message"]
@@ -237,13 +241,6 @@ def run_batch(
     numbers |= {"trips": len(tasks), "skipped": counts["skipped"], "frames": counts["frames"]}
     seconds = time.perf_counter() - started
     return BatchReport(**numbers, seconds=seconds, messages=messages, planned=planned)
-
-
-def _check_parts(executor: object, on_record: object) -> None:
-    if executor is not None and not hasattr(executor, "submit"):
-        raise invalid("executor", "be an executor of concurrent.futures", executor, "omit it")
-    if on_record is not None and not callable(on_record):
-        raise invalid("on_record", "be a function of a record", on_record)
 
 
 def _parse_shard(shard: object) -> tuple[int, int]:
@@ -267,8 +264,9 @@ def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -
     for key, value in given.items():  # a path or a number of NumPy
         if isinstance(value, (os.PathLike, np.generic)):
             given[key] = os.fspath(value) if isinstance(value, os.PathLike) else value.item()
-    if os.path.isfile(str(given.get("camera"))):
-        given["camera"] = os.path.abspath(given["camera"])
+    camera = given.get("camera")
+    if isinstance(camera, str) and os.path.isfile(camera):
+        given["camera"] = os.path.abspath(camera)
     settings = {"model": name, "options": given, **others}
     try:
         json.dumps(settings)

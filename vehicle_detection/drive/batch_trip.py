@@ -12,7 +12,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -200,7 +200,7 @@ def fingerprint_of(settings: Mapping[str, Any]) -> str:
     """Hash of the model's file, and of the camera's if there is one."""
     shipped, camera = shipped_model(settings["model"]), settings["options"].get("camera")
     data = shipped.read_bytes() if shipped.is_file() else Path(settings["model"]).read_bytes()
-    if os.path.isfile(str(camera)):
+    if isinstance(camera, str) and os.path.isfile(camera):
         data += Path(camera).read_bytes()
     return hashlib.sha256(data).hexdigest()
 
@@ -254,7 +254,8 @@ def _date(trip: Trip, source: Mapping[str, Any]) -> str:
         return trip.start.date().isoformat()
     tag = source["tag"]
     if tag and not is_url(source["uri"]):
-        return datetime.datetime.fromtimestamp(int(tag) / 1e9, datetime.UTC).date().isoformat()
+        with suppress(ValueError, OverflowError):  # beyond the year 9999, as of a damaged card
+            return datetime.datetime.fromtimestamp(int(tag) / 1e9, datetime.UTC).date().isoformat()
     return "unknown"
 
 

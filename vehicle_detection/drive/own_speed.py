@@ -337,10 +337,10 @@ def _read_gpx(data: bytes, name: str) -> Floats:
     try:
         parser.feed(data)
         document = parser.close()
-    except ElementTree.ParseError as error:
-        raise InvalidInputError(f"path {name} is no GPX file: {error}; export it again") from None
     except InvalidInputError as error:
         raise InvalidInputError(f"path {name} is refused: {error}") from None
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two: of the encoding
+        raise InvalidInputError(f"path {name} is no GPX file: {error}; export it again as UTF-8") from None
     # GPX 1.0 and 1.1 have different namespaces; the speed of version 1.1 is in an extension.
     points = list(document.iterfind(".//{*}trkpt"))
     times = [point.findtext(".//{*}time") or "" for point in points]

@@ -1,4 +1,4 @@
-"""Charts over the time of a video: where the template ``report.html.j2`` draws what, as SVG.
+"""Charts over the time of a video: positions and texts for the SVG in the template ``report.html.j2``.
 
 Horizontal positions are percentages of the width, so that a chart fits any screen; text sizes and heights are
 pixels. ``report.js`` draws the curves from the numbers that the page holds.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 
 from vehicle_detection.drive.motion import TrackHistory
 
@@ -44,28 +45,28 @@ class TimeAxis:
 
     def ticks(self, max_ticks: int = 6) -> list[float]:
         """Round times in seconds from 0 on, at most about `max_ticks`."""
-        step = next((step for step in _TICK_STEPS if self.seconds / step < max_ticks), 0)
-        step = step or 3600 * math.ceil(self.seconds / 3600 / max_ticks)
+        hours = 3600 * math.ceil(self.seconds / 3600 / max_ticks)
+        step = next((step for step in _TICK_STEPS if self.seconds / step < max_ticks), hours)
         return [number * step for number in range(int(self.seconds / step) + 1)]
 
     def marks(self) -> list[tuple[float, str]]:
         """Positions (percent) and texts of the times below a chart."""
         ticks = self.ticks()
-        tenths = ticks[1:2] < [1.0]
+        tenths = len(ticks) == 1 or ticks[1] < 1
         return [(self.percent(each * self.fps), format_time(each, tenths=tenths)) for each in ticks]
 
 
 def assign_rows(tracks: Sequence[TrackHistory], axis: TimeAxis) -> list[int]:
-    """Row of each track: its own, or of many tracks the first in which it does not touch an earlier one."""
+    """Row of each track: its own, or if there are many, the first that is free again when it begins."""
     if len(tracks) <= MAX_ROWS:
         return list(range(len(tracks)))
     min_gap = axis.frames // 200
-    ends: list[int] = []  # last frame in each row
+    ends: dict[int, int] = {}  # last frame in each row
     rows = []
     for track in tracks:
-        free = (row for row, end in enumerate(ends) if end + min_gap < track.first)
-        rows.append(next(free, len(ends)))
-        ends[rows[-1] : rows[-1] + 1] = [track.last]
+        row = next(row for row in count() if row not in ends or ends[row] + min_gap < track.first)
+        rows.append(row)
+        ends[row] = track.last
     return rows
 
 
