@@ -315,3 +315,9 @@ def test_a_missing_pyarrow_is_reported_before_the_video(tmp_path, monkeypatch):
     ):
         pass
     assert os.listdir(tmp_path) == []
+
+
+def test_frames_with_names_have_no_times(tmp_path):
+    table = TrackTable(["a.jpg"], [1], [[0, 0, 9, 9]], score=[1.0])
+    with pytest.raises(InvalidInputError, match="fps must be omitted for frames with names"):
+        write_tracks(table, tmp_path / "boxes.csv", fps=25)

@@ -1,4 +1,4 @@
-"""Environment variables: limits on files from elsewhere, and those of numba that kernels do not work with."""
+"""Environment variables: limits on files from elsewhere, and values of numba's with which kernels fail."""
 
 from __future__ import annotations
 
@@ -33,9 +33,13 @@ class Limit(Enum):
             return int(self.value[1])
         if not text.isascii() or not text.isdecimal() or len(text) > 16 or not 1 <= int(text) <= 10**15:
             raise InvalidInputError(
-                f"{self.variable} must be a number of {self.value[2]}, at least 1; got {text!r}"
+                f"{self.variable} must be a number of {self.value[2]} from 1 to 1e15; got {text!r}"
             )
         return int(text)
+
+    def exceeded(self, name: str) -> str:
+        """Return the message of a file that is too large."""
+        return f"{name} is larger than {self.current():,} bytes; if it is meant to be, set {self.variable}"
 
 
 def read_regular_file(
@@ -53,7 +57,7 @@ def read_regular_file(
     except OSError as problem:
         raise error(f"{name} cannot be read: {problem.strerror}") from problem
     if len(data) > limit.current():  # it has grown
-        raise error(_too_large(name, limit))
+        raise error(limit.exceeded(name))
     return data
 
 
@@ -76,15 +80,11 @@ def check_regular_file(
     if not stat.S_ISREG(status.st_mode):
         raise error(f"{name} is a device or a pipe, which may never end; copy it to a file first")
     if limit is not None and status.st_size > limit.current():
-        raise error(_too_large(name, limit))
-
-
-def _too_large(name: str, limit: Limit) -> str:
-    return f"{name} is larger than {limit.current():,} bytes; if it is meant to be, set {limit.variable}"
+        raise error(limit.exceeded(name))
 
 
 def check_environment() -> None:
-    """Raise if numba would fail, or run the kernels, which need its compiler, as Python."""
+    """Raise if numba would fail, or would not compile the kernels."""
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         value = os.environ["NUMBA_DISABLE_JIT"]
         raise InvalidInputError(f"NUMBA_DISABLE_JIT must be unset or 0, or kernels fail; got {value!r}")

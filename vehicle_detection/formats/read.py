@@ -274,16 +274,12 @@ def _read_mot_zip(source: Path, classes: Collection[str] | None) -> FileRows:
 def _read_members(source: Path, *names: str) -> list[str | None]:
     """Read text files of an archive; None for each that it lacks."""
     check_regular_file(source, str(source), Limit.TEXT_BYTES, error=DatasetError)
-    limit = Limit.TEXT_BYTES.current()
     try:
         with zipfile.ZipFile(source) as archive:
             known = {info.filename: info for info in archive.infolist()}
             for name in names:
-                if name in known and known[name].file_size > limit:
-                    raise DatasetError(
-                        f"{source}: {name} is larger than {limit:,} bytes; if it is meant to be so large, "
-                        f"set {Limit.TEXT_BYTES.variable}"
-                    )
+                if name in known and known[name].file_size > Limit.TEXT_BYTES.current():
+                    raise DatasetError(Limit.TEXT_BYTES.exceeded(f"{source}: {name}"))
             return [archive.read(name).decode("utf-8-sig") if name in known else None for name in names]
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, RuntimeError, OSError) as error:
         raise DatasetError(f"{source} is not a zip archive that can be read ({error})") from None

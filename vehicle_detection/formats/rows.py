@@ -49,8 +49,7 @@ class ClassNumbers:
     def __call__(self, record: Record) -> tuple[int, str]:
         """Return number and name of the class of a row, with a warning if it is not read by default."""
         name = class_name(record.get("label"))
-        usual = name in (UNKNOWN_LABEL, *VEHICLE_CLASSES)
-        if not usual and name not in self._unusual and not record.get("ignore"):
+        if name not in (*VEHICLE_CLASSES, *self._unusual) and not record.get("ignore"):
             self._unusual.add(name)
             _LOGGER.warning("boxes of class %r are read back only if classes= names it", name)
         self.used.add(name)

@@ -425,6 +425,8 @@ def write_tracks(
     for record in records if named else ():
         record["track_id"] = None if record["track_id"] == NO_TRACK else record["track_id"]
     if fps is not None:
+        if named:
+            raise invalid("fps", "be omitted for frames with names, which have no times", fps)
         rate = check.number(fps, "fps", above=0, high=1e6)
         columns = (*columns, TIME_COLUMN)
         records = [_round({**record, TIME_COLUMN: record["frame"] / rate}) for record in records]
