@@ -31,10 +31,7 @@ from vehicle_detection.camera import Camera, truncated_edges
 from vehicle_detection.drawing import Color, Image, Rectangle
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import HeatParams, frame_heat
-from vehicle_detection.tracking import FrameResult, Track
-
-# Frame rate that is assumed for results without times.
-_USUAL_FPS = 25.0
+from vehicle_detection.tracking import USUAL_FPS, FrameResult, Track
 
 LABEL_FIELDS = ("id", "score", "distance", "speed", "std")
 """Fields of a track's label; ``"std"`` adds standard errors to distance and speed."""
@@ -389,7 +386,7 @@ class Annotator:
 
     def reset(self, *, fps: float | None = None) -> None:
         """Forget all frames, before the first frame of another video; `fps` is for results without times."""
-        self._fps = _USUAL_FPS if fps is None else check.number(fps, "fps", above=0)
+        self._fps = USUAL_FPS if fps is None else check.number(fps, "fps", above=0)
         self._placer = drawing.LabelPlacer()
         self._panel: BirdsEyePanel | None = None
         self._time = -math.inf

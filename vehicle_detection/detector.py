@@ -37,15 +37,13 @@ from vehicle_detection.regions import RegionParams, find_vehicles
 from vehicle_detection.results import ImageDetections, image_distances
 from vehicle_detection.search import FrameSearch, SearchResult
 from vehicle_detection.svm import VehicleClassifier, load_classifier
-from vehicle_detection.tracking import FrameResult, SceneCuts, Tracker, TrackParams, small_gray
+from vehicle_detection.tracking import USUAL_FPS, FrameResult, SceneCuts, Tracker, TrackParams, small_gray
 
 Image = NDArray[np.uint8]
 Path = str | os.PathLike[str]
 
 # Standard error of the horizon that the bands of a search assume, as a fraction of their tolerance.
 _HORIZON_STD = 0.4
-# Frame rate that is assumed where it is unknown.
-_USUAL_FPS = 25.0
 # Probabilities beyond these have no useful threshold.
 _MIN_CONF, _MAX_CONF = 0.001, 0.999
 # Files of PyTorch are refused with a message that says how to export them.
@@ -431,7 +429,7 @@ class VehicleDetector(Closing):
         self.tracker = Tracker(
             self.track_params,
             camera=self.camera,
-            fps=self._fps or _USUAL_FPS,
+            fps=self._fps or USUAL_FPS,
             calibration=self.detector.calibration,
         )
         self.annotator.reset(fps=self._fps)
@@ -563,7 +561,7 @@ class VehicleDetector(Closing):
         if any(track.speed_mps is not None for track in result.shown):
             self._warned = True
             warnings.warn(
-                f"the speeds assume {_USUAL_FPS:g} frames per second, because the frames came without times; "
+                f"the speeds assume {USUAL_FPS:g} frames per second, because the frames came without times; "
                 "pass their times in seconds to process, or call detector.reset(fps=...) first; in moviepy "
                 "use annotate_clip(clip, detector)",
                 stacklevel=4,

@@ -151,7 +151,7 @@ def test_a_report_without_frames():
         ({"start": 0.001, "end": 0.002}, "end must be at least one frame later than the start, at 29.97"),
         ({"detector": object()}, "detector must have the methods .* without search; pass a VehicleDetector"),
         ({"source": "."}, r"source \. holds no videos and no images; check the path"),
-        ({"source": os.devnull}, "is not a regular file"),
+        ({"source": os.devnull}, "is a device or a pipe"),
         ({"target": "missing/out.mp4"}, "target needs an existing folder"),
         ({"target": "."}, "target must be a file, got the folder"),
         ({"target": "out.gif"}, r"target must end in .mp4 or .*, got 'out.gif'; write 'out.mp4'"),

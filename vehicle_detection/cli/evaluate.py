@@ -48,7 +48,6 @@ def evaluate(
 
     import numpy as np
 
-    from vehicle_detection._common import write_text
     from vehicle_detection.evaluation import evaluate_distances
     from vehicle_detection.tables import NO_TRACK
 
@@ -84,7 +83,7 @@ def evaluate(
             print_error(f"note: the tracks are not scored: {count} {noun} no track in {file}")
     if json is not None:
         plain = {name: each.to_dict() for name, each in scores.items()}
-        write_text(json, dumps(plain, indent=2) + "\n")
+        common.write_text(json, dumps(plain, indent=2) + "\n")
 
 
 def _note_frames_of_one_file(

@@ -29,10 +29,8 @@ def info(
     title, facts = loaded.summary()
     print_facts(f"{model}: {title}", {"license": common.model_terms(loaded.metadata), **facts})
     for name, values in loaded.metadata.items():
-        printed = False
-        with contextlib.suppress(
-            AttributeError, KeyError, OverflowError, TypeError, ValueError
-        ):  # of another shape
+        printed = False  # metrics of another shape are printed as they are
+        with contextlib.suppress(AttributeError, KeyError, OverflowError, TypeError, ValueError):
             printed = name == "metrics" and _print_metrics(values)
         if not printed:
             print_facts(name, values if isinstance(values, dict) else {"": values})

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import vehicle_detection as vd
+from vehicle_detection.cli import common
 from vehicle_detection.cli.options import NON_VEHICLES, PATCHES, VEHICLES, flag, option
 from vehicle_detection.cli.output import (
     capture_stderr,
@@ -56,8 +57,6 @@ def train(
     ),
 ) -> None:
     """Train a model on patches, and evaluate it on held-out patches; by default like the model "highway"."""
-    from vehicle_detection._common import encodable, write_text
-
     check_distinct_paths({"--non-vehicles": non_vehicles}, {"--vehicles": vehicles})
     sources = {"--vehicles": vehicles, "--non-vehicles": non_vehicles}
     targets = check_targets({"--output": output, "--report": report, "--card": card}, sources)
@@ -86,7 +85,7 @@ def train(
         classifier.save(output)
         if report is not None:
             plain = evaluated.to_dict() | {"others": [other.to_dict() for other in others]}
-            write_text(report, json.dumps(plain, indent=2) + "\n")
+            common.write_text(report, json.dumps(plain, indent=2) + "\n")
         if card is not None:
             words = ["--vehicles", vehicles.name, "--non-vehicles", non_vehicles.name, "--features", features]
             words += ["--split", split, "--C", f"{C:g}", "--seed", str(seed)] + ["--no-mirror"] * no_mirror
@@ -97,7 +96,7 @@ def train(
             text = vd.training.model_card(
                 classifier, evaluated, name=output.stem, others=others, command=command
             )
-            write_text(card, encodable(text))
+            common.write_text(card, common.encodable(text))
     print_line(f"wrote {', '.join(map(str, targets))}")
 
 

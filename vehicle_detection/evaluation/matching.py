@@ -16,7 +16,7 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.formats import without_suffix
 from vehicle_detection.tables import NO_TRACK, FrameKey, TrackTable, check_keys, frame_order
 
-log = logging.getLogger(__name__)
+_LOGGER = logging.getLogger(__name__)
 
 
 def match_names(table: TrackTable, keys: Sequence[FrameKey], sides: tuple[str, str]) -> TrackTable:
@@ -72,7 +72,7 @@ def prepare_evaluation(
             f"frame keys must be all numbers or all names, got {listed}; use the same keys on both sides"
         )
     if given is None and len(first) == 2 and set(predictions.frame_keys).isdisjoint(labels.frame_keys):
-        log.warning("predictions and labels share no frame; they hold %r and %r", *first.values())
+        _LOGGER.warning("predictions and labels share no frame; they hold %r and %r", *first.values())
     if given is None:
         return predictions, labels, sorted({*predictions.frame_keys, *labels.frame_keys}, key=frame_order)
     for key, count in Counter(given).items():

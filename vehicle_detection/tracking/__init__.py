@@ -12,6 +12,7 @@ from vehicle_detection.tracking.pixels import SceneCuts, small_gray
 from vehicle_detection.tracking.track import (
     TRACK_VALUES,
     UNKNOWN_LABEL,
+    USUAL_FPS,
     FrameResult,
     Track,
     TrackParams,
@@ -23,6 +24,7 @@ from vehicle_detection.tracking.tracker import Tracker
 __all__ = [
     "TRACK_VALUES",
     "UNKNOWN_LABEL",
+    "USUAL_FPS",
     "FrameResult",
     "HorizonEstimate",
     "SceneCuts",

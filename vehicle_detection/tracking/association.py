@@ -118,15 +118,15 @@ def hidden_edges(boxes: Floats, tracked: Floats, rows: Sequence[int], is_opaque:
     heights = (boxes[:, 3] - boxes[:, 1])[:, None]
     shared = np.minimum(boxes[:, None, 3], tracked[:, 3]) - np.maximum(boxes[:, None, 1], tracked[:, 1])
     others = np.arange(len(tracked)) != np.array(rows)[:, None]
-    hiding = others & is_opaque & _are_nearer(boxes, tracked) & (shared > _MIN_SHARED_HEIGHT * heights)
+    nearer = others & is_opaque & _are_nearer(boxes, tracked)
+    hiding = nearer & (shared > _MIN_SHARED_HEIGHT * heights)
     hidden = np.zeros(boxes.shape, np.bool_)
     for edge, outward in (0, -1), (2, 1):
         x = boxes[:, edge, None] + outward * _HIDING_DISTANCE * heights
         hidden[:, edge] = (hiding & (tracked[:, 0] < x) & (x < tracked[:, 2])).any(axis=1)
     y, widths = boxes[:, 3, None] + _HIDING_DISTANCE * heights, (boxes[:, 2] - boxes[:, 0])[:, None]
     across = np.minimum(boxes[:, None, 2], tracked[:, 2]) - np.maximum(boxes[:, None, 0], tracked[:, 0])
-    below = others & is_opaque & _are_nearer(boxes, tracked) & (tracked[:, 1] < y)
-    hidden[:, 3] = (below & (across > _MIN_SHARED_WIDTH * widths)).any(axis=1)
+    hidden[:, 3] = (nearer & (tracked[:, 1] < y) & (across > _MIN_SHARED_WIDTH * widths)).any(axis=1)
     return hidden
 
 

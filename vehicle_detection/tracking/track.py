@@ -22,6 +22,8 @@ TRACK_VALUES = ("score", "distance_m", "speed_mps", "confidence", "distance_std_
 """What tables state of a track besides its id and box, in the order of their columns."""
 UNKNOWN_LABEL = "vehicle"
 """Class of a vehicle whose kind is unknown."""
+USUAL_FPS = 25.0
+"""Frame rate that is assumed where it is unknown."""
 TIME_TOLERANCE = 1e-6
 """Float tolerance in seconds when comparing summed frame times with a limit."""
 
@@ -48,8 +50,9 @@ class TrackParams(Checked):
         In the first frame, and in the first one after a scene cut, a detection with this score is confirmed
         at once, because no earlier frame could have shown it.
     tentative_coast, max_coast, max_hidden
-        A tentative and a confirmed track end after these times without a detection. The time in which another
-        vehicle hides a confirmed one has a limit of its own, `max_hidden`.
+        A tentative and a confirmed track end after these times without a detection; a vehicle that is
+        detected again later gets another id. The time in which another vehicle hides a confirmed one has a
+        limit of its own, `max_hidden`.
     show_coast, show_covered
         A confirmed track is shown for `show_coast` without a detection, and no longer than it was detected
         since its confirmation. While another vehicle hides it, it is shown up to `max_coast`, no longer than

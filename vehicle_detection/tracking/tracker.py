@@ -49,7 +49,7 @@ from vehicle_detection.tracking.kalman import (
     exit_times,
 )
 from vehicle_detection.tracking.pixels import Gray, measure_growth
-from vehicle_detection.tracking.track import TIME_TOLERANCE, UNKNOWN_LABEL, Track, TrackParams
+from vehicle_detection.tracking.track import TIME_TOLERANCE, UNKNOWN_LABEL, USUAL_FPS, Track, TrackParams
 
 # Visible fraction of a box below which its vehicle leaves the frame if it moves outwards, and below which it
 # has left; covered fractions above which a vehicle is hidden, and above which nothing of it is visible.
@@ -201,7 +201,7 @@ class Tracker:
         self,
         params: TrackParams | None = None,
         *,
-        fps: float = 25.0,
+        fps: float = USUAL_FPS,
         camera: Camera | None = None,
         calibration: Platt | None = LOG_ODDS,
     ) -> None:

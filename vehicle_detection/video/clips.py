@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import check, describe
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.tracking import FrameResult
+from vehicle_detection.tracking import USUAL_FPS, FrameResult
 
 Clip = TypeVar("Clip")
 
-# Frame rate that is assumed where it is unknown.
-_USUAL_FPS = 25.0
 # Frames: rounding error of a time times the frame rate, as in moviepy.
 _FRAME_TOLERANCE = 1e-5
 
@@ -86,7 +84,7 @@ class _ClipAnnotator:
         time = float(t) if not self._fps else int(t * self._fps + _FRAME_TOLERANCE) / self._fps
         if time != self._time:
             if self._time is None or time < self._time:
-                self._detector.reset(fps=self._fps or _USUAL_FPS)
+                self._detector.reset(fps=self._fps or USUAL_FPS)
                 self._count = 0
             frame = get_frame(time)
             if frame.dtype != np.uint8:  # effects such as FadeIn return fractions of gray levels

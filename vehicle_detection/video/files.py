@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path, PurePath
 
-from vehicle_detection._common import check, is_hidden, is_url, natural_key
+from vehicle_detection._common import check, check_regular_file, is_hidden, is_url, natural_key
 from vehicle_detection.errors import InvalidInputError
 
 VIDEO_SUFFIXES = {
@@ -73,12 +73,7 @@ def walk_files(folder: Path, name: str = "source") -> Iterator[Path]:
 def check_file(path: str | os.PathLike[str]) -> Path:
     """Return the path of a readable regular file."""
     path = check.path(path, "source", kind="the path of a video file")
-    if path.is_dir():
-        raise InvalidInputError(f"source {path} is a folder; choose a video file in it")
-    if not path.exists():
-        raise InvalidInputError(f"source {path} does not exist; check the path")
-    if not path.is_file():
-        raise InvalidInputError(f"source {path} is not a regular file; record the stream to a file first")
+    check_regular_file(path, f"source {path}")
     if not os.access(path, os.R_OK):
         raise InvalidInputError(f"source {path} is not readable; change its permissions")
     return path

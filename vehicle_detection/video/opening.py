@@ -15,6 +15,7 @@ from pathlib import Path
 
 from vehicle_detection._common import NETWORK_TIMEOUT, check, describe, local_path, temporary_folder
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tracking import USUAL_FPS
 from vehicle_detection.video.ffmpeg import (
     input_options,
     network_options,
@@ -28,7 +29,6 @@ from vehicle_detection.video.reading import FrameReader, check_span, frame_range
 from vehicle_detection.video.remote import download
 from vehicle_detection.video.sources import (
     NO_RATE,
-    USUAL_FPS,
     FrameSource,
     ImageSequence,
     Stream,

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import Closing, temporary_folder
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.images import read_image
+from vehicle_detection.tracking import USUAL_FPS
 from vehicle_detection.video.ffmpeg import input_options, restrict_input, source_name
 from vehicle_detection.video.files import IMAGE_SUFFIXES
 from vehicle_detection.video.live import LiveStream
@@ -28,8 +29,6 @@ from vehicle_detection.video.yuv import DecodedFrame
 
 _LOGGER = logging.getLogger(__name__)
 
-USUAL_FPS = 25.0
-"""Frame rate that is assumed where none is stated."""
 NO_RATE = "%s states no frame rate: 25 is assumed, on which times and speeds depend; set it with fps or --fps"
 """Warning of the assumed frame rate."""
 
@@ -55,7 +54,7 @@ class FrameSource(Closing):
         self.files = tuple(files)  # that are read, in order; empty for streams
         self.segment_starts: tuple[float, ...] = (0.0,)  # of the files of a trip, in seconds of the video
         self.breaks: set[int] = set()  # frames that begin another scene, as after a gap between files
-        self._states = {path: _state(path) for path in self.files if path.suffix not in IMAGE_SUFFIXES}
+        self._states = {path: _state(path) for path in files if path.suffix.lower() not in IMAGE_SUFFIXES}
         self._on_close = contextlib.ExitStack()
 
     def __repr__(self) -> str:
@@ -236,9 +235,8 @@ class VideoSegments(FrameSource):
             begin, seconds = info.first_timestamp, float(info.frames / info.fps)
             text += f"file '{quoted}'\ninpoint {begin:.6f}\n"
             text += f"outpoint {begin + seconds:.6f}\nduration {seconds:.6f}\n"
-        listing.write_bytes(
-            text.encode("utf-8", "surrogateescape")
-        )  # a path that is not UTF-8 keeps its bytes
+        # A path that is not UTF-8 keeps its bytes.
+        listing.write_bytes(text.encode("utf-8", "surrogateescape"))
         # Times as in the list: the first sound may lie before 0, which ffmpeg would take for the start.
         options: tuple[str, ...] = ("-seek_timestamp", "1", "-f", "concat", "-safe", "0")
         options += (*restrict_input("file", ",concat"), "-i", f"file:{listing}")

@@ -102,7 +102,7 @@ class PlanarFrame(DecodedFrame):
         """Convert fewer pixels, the means over squares of luma; chroma has half the size already."""
         luma, *chroma = split_planes(self.planes)
         size = luma.shape[0] // factor, luma.shape[1] // factor
-        # OpenCV takes means over parts of pixels slowly, and chroma is smooth.
+        # Chroma is reduced by 1.5 then: OpenCV takes means over parts of pixels slowly, and chroma is smooth.
         method = cv2.INTER_LINEAR if factor == 3 else cv2.INTER_AREA
         return self._convert(
             _resize(luma, size, cv2.INTER_AREA), *(_resize(plane, size, method) for plane in chroma)
