@@ -504,7 +504,7 @@ def _parse_xml(text: str) -> dict[str, Any]:
 def _from_calibration(path: Path, values: dict[str, Any]) -> Camera:
     """Return the camera of a calibration."""
     try:
-        width, height = (max(int(values[f"image_{side}"]), 1) for side in ("width", "height"))
+        width, height = (max(int(float(values[f"image_{side}"])), 1) for side in ("width", "height"))
         matrix = np.array(values["camera_matrix"]["data"], np.float64).reshape(3, 3)
         stated = values.get("distortion_coefficients") or {"data": []}
         distortion = np.array(stated["data"], np.float64).reshape(-1)

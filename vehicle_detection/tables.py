@@ -7,6 +7,7 @@ import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from numbers import Real
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, overload
 
 import numpy as np
@@ -502,16 +503,16 @@ def _parse_frames(cells: Sequence[Any], places: Sequence[str]) -> list[FrameKey]
     """Frames as numbers or names; whole numbers that a concatenation has made floats are numbers again."""
     keys: list[FrameKey] = []
     for cell, place in zip(cells, places, strict=True):
-        if cell in (None, "") or cell != cell:  # NaN; a frame may be called "nan"
+        if isinstance(cell, str) and cell:
+            keys.append(cell)  # which may be "nan"
+        elif _is_missing(cell):
             raise DatasetError(f"{place}: frame is empty; enter its number from 0 or its file name")
-        if isinstance(cell, str):
-            keys.append(cell)
-        elif isinstance(cell, bool) or not 0 <= cell <= _MAX_ID or cell != int(cell):
+        elif isinstance(cell, Real) and type(cell) is not bool and 0 <= cell <= _MAX_ID and cell == int(cell):
+            keys.append(int(cell))
+        else:
             raise DatasetError(
                 f"{place}: frame must be a whole number from 0 or a name, got {describe(cell)}"
             )
-        else:
-            keys.append(int(cell))
         if type(keys[-1]) is not type(keys[0]):
             raise DatasetError(f"{place}: frame must be a number in every row, or a name in every row")
     return keys

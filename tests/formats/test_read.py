@@ -473,6 +473,10 @@ def test_names_of_yolo_classes(tmp_path, names, text, known):
 def test_numbers_that_only_python_reads(tmp_path):
     with pytest.raises(DatasetError, match="x1 must be a finite number, got '1_0'"):
         read_labels(written(tmp_path, "frame,track,x1,y1,x2,y2\n0,1,1_0,2,30,40\n"))
+    for frame in ("{}", "[1]", "true"):
+        row = f'{{"frame": {frame}, "track": 1, "x1": 1, "y1": 1, "x2": 9, "y2": 9}}'
+        with pytest.raises(DatasetError, match="line 1: frame must be a whole number from 0 or a name"):
+            read_labels(written(tmp_path, row, "a.jsonl"))
     for name in ("a.jsonl", "a.json"):
         with pytest.raises(DatasetError, match="a number has too many digits"):
             read_labels(written(tmp_path, '{"frame": ' + "9" * 5000 + "}", name))
