@@ -7,7 +7,6 @@ import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from numbers import Real
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, overload
 
 import numpy as np
@@ -52,6 +51,7 @@ _LOGGER = logging.getLogger(__name__)
 _FLAGS = {"false": False, "true": True, "0": False, "1": True, "0.0": False, "1.0": True}
 # Distances and speeds beyond the first are unknown, corners of boxes are errors.
 _ABSURD, _MAX_ID = 1e9, 2**62
+_REAL = (int, float, np.integer, np.floating)
 
 
 class _Column(NamedTuple):
@@ -507,7 +507,7 @@ def _parse_frames(cells: Sequence[Any], places: Sequence[str]) -> list[FrameKey]
             keys.append(cell)  # which may be "nan"
         elif _is_missing(cell):
             raise DatasetError(f"{place}: frame is empty; enter its number from 0 or its file name")
-        elif isinstance(cell, Real) and type(cell) is not bool and 0 <= cell <= _MAX_ID and cell == int(cell):
+        elif isinstance(cell, _REAL) and type(cell) is not bool and 0 <= cell <= _MAX_ID and cell % 1 == 0:
             keys.append(int(cell))
         else:
             raise DatasetError(

@@ -316,10 +316,11 @@ def _draw_end(buffer: _SpriteBuffer, pose: VehiclePose, surface: Surface, start:
         x = (right * ahead - left) * np.float32(x_scale) - 0.5
         return x, (top - up * ahead) * np.float32(y_scale) - 0.5
 
-    for _ in range(4 if surface.depth is not None else 0):
-        x, y = surface_pixels(PIXELS_PER_METER, PIXELS_PER_METER)
-        depth = cv2.remap(surface.depth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        ahead = np.asarray(np.float32(start) + depth, np.float32)
+    for _ in range(4):
+        if surface.depth is not None:
+            x, y = surface_pixels(PIXELS_PER_METER, PIXELS_PER_METER)
+            depth = cv2.remap(surface.depth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            ahead = np.asarray(np.float32(start) + depth, np.float32)
     buffer.composite(columns, cv2.remap(rgba, *surface_pixels(across, upwards), cv2.INTER_LINEAR))
 
 
