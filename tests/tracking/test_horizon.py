@@ -71,6 +71,14 @@ def test_the_side_of_a_vehicle_in_another_lane_does_not_count_as_width():
     assert error(estimated(cars)) < 5
 
 
+def test_a_vehicle_that_turns_hardly_moves_the_horizon():
+    """It shows its rear alone far to the side, where the others show a side, too."""
+    boxes = [[on_road(12, x=8 - 0.1 * i, length=0)] for i in range(25)]
+    assert error(estimated(boxes)) < error(GUESS)
+    right = Camera.for_frame(FRAME, horizon=0.56, horizon_std_px=20)
+    assert error(estimated(boxes, camera=right)) < 30  # 49 if the side is taken for certain
+
+
 def test_boxes_that_are_not_on_the_road_are_ignored():
     cars = [on_road(15), on_road(30), on_road(50)]
     plain = estimated([cars] * 100)

@@ -22,6 +22,8 @@ from vehicle_detection.errors import InvalidInputError
 _CORRELATION_TIME, _MEMORY_TIME, _MISFIT_TIME = 0.5, 30.0, 3.0
 # Standard errors beyond which a vehicle is an outlier; minimum weight of a vehicle, relative to the largest.
 _OUTLIER, _MIN_WEIGHT = 3.0, 1e-4
+# Standard deviation of the width of a visible side, as a fraction: a turn shows more of it or less.
+_SIDE_STD = 0.5
 # Minimum standard error of the estimate, in pixels of the reference camera.
 _MIN_STD_PX = 1.0
 # The following constants are those of `estimate_horizon`. Number of boxes required.
@@ -79,13 +81,15 @@ class HorizonFilter:
         sides = boxes[:, 2:] - boxes[:, :2]
         # The width of the near face alone.
         face_scale = camera.focal_px * camera.vehicle_width_m
-        width = sides[:, 0] * face_scale / camera.width_times_distance(lateral_offsets(boxes, frame))
+        face = face_scale / camera.width_times_distance(lateral_offsets(boxes, frame))
+        width = sides[:, 0] * face
         # The width that the face would have at the distance of the tires, where the box ends.
         width /= 1 + camera.overhang_m * width / face_scale
         edge_std = np.hypot(camera.bottom_std_px * scale, camera.box_std * sides)
         variance = (
             np.square(edge_std[:, 1])
             + 2 * np.square(self._slope * edge_std[:, 0])
+            + np.square(self._slope * _SIDE_STD * (1 - face) * sides[:, 0])
             + np.square(camera.pitch_std_px * scale)
         )
         slope = camera.height_m / camera.vehicle_width_m
