@@ -33,14 +33,16 @@ TASKS = {
 
 # Runs in the process of a version. It uses only functions that all versions have.
 _WORKER = """
-import sys, time
+import inspect, sys, time
 import numpy as np
 import vehicle_detection as vd
 frame, source, target = np.load(sys.argv[1]), sys.argv[2], sys.argv[3]
+# Earlier versions called it so.
+name = "jobs" if "jobs" in inspect.signature(vd.VehicleDetector.__init__).parameters else "n_jobs"
 detectors = {}
 def detector(model, jobs):
     if (model, jobs) not in detectors:
-        detectors[model, jobs] = vd.VehicleDetector(vd.load_model(model), jobs=jobs)
+        detectors[model, jobs] = vd.VehicleDetector(vd.load_model(model), **{name: jobs})
     return detectors[model, jobs]
 def seconds(function, *arguments, **options):
     start = time.perf_counter()
