@@ -143,4 +143,6 @@ def test_text_files_have_the_same_line_breaks_everywhere():
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
                 named = {keyword.arg for keyword in node.keywords}
-                assert node.func.attr != "write_text" or "newline" in named, f"{name} {node.lineno}"
+                is_own = isinstance(node.func.value, ast.Name) and node.func.value.id == "common"
+                is_set = node.func.attr != "write_text" or "newline" in named
+                assert is_own or is_set, f"{name} {node.lineno}"
