@@ -168,7 +168,7 @@ class Sampler:
     def _change_light(self, image: Tensor, rng: Rng) -> Tensor:
         """Change gamma, contrast, brightness, saturation, color cast, fog, sharpness, noise, compression."""
         n = len(image)
-        # An eighth or less of the samples is of night.
+        # 8% of the samples become night.
         gamma = np.where(rng.random(n) < 0.08, rng.uniform(1.5, 2.5, n), np.exp(rng.uniform(-0.5, 0.5, n)))
         saturation = np.where(rng.random(n) < 0.12, 0.0, rng.uniform(0.4, 1.5, n))
         contrast, brightness = rng.uniform(0.6, 1.4, n), rng.uniform(0.7, 1.3, n)
