@@ -78,7 +78,7 @@ def test_what_only_posix_has_is_guarded():
 
 
 # Modules that need the extra train, which may be missing here.
-TORCH_MODULES = ("architecture", "export", "fine_tune", "loss", "network", "weights")
+TORCH_MODULES = ("architecture", "export", "fine_tune", "loss", "network", "samples", "weights")
 
 # Import the libraries first, which need the real platform; then all modules of this one, as on Windows.
 AS_ON_WINDOWS = f"""

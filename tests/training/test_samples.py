@@ -2,13 +2,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_detection.training import samples
-from vehicle_detection.training.frames import TrainingFrame
-from vehicle_detection.training.samples import Sampler, move_boxes
+torch = pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
+
+from vehicle_detection.training import samples  # noqa: E402
+from vehicle_detection.training.frames import TrainingFrame  # noqa: E402
+from vehicle_detection.training.samples import Sampler, move_boxes  # noqa: E402
 
 SIZE = 160, 96  # width, height
 
