@@ -1,16 +1,14 @@
-"""An object store on the loopback interface, of which every third request fails, and its fsspec file system.
+"""An object store in a folder, of which every third request fails, as a file system of fsspec.
 
 The file system is registered for the protocol ``loopback`` in every process that finds `SITE` on its path.
 """
 
-import contextlib
 import hashlib
-import http.client
-import http.server
-import json
+import itertools
 import os
+import tempfile
 import threading
-from urllib.parse import quote, unquote
+from pathlib import Path
 
 from fsspec import AbstractFileSystem
 
@@ -18,77 +16,13 @@ SITE = """
 import fsspec
 fsspec.register_implementation("loopback", "tests.drive.object_store.LoopbackFileSystem", clobber=True)
 """
-PORT = "VEHICLE_TEST_OBJECT_STORE"
+FOLDER = "VEHICLE_TEST_OBJECT_STORE"
 
-
-class ObjectStore(http.server.ThreadingHTTPServer):
-    """Objects by key; `requests` counts all requests, of which every third is answered with 503.
-
-    A thread's repetition of a failed request is answered: otherwise a request of one of several threads could
-    fail by chance as often as it is tried.
-    """
-
-    daemon_threads = True
-
-    def __init__(self):
-        super().__init__(("127.0.0.1", 0), _Handler)
-        self.objects, self.requests, self.written = {}, 0, []
-        self.failed = {}
-        self.lock = threading.Lock()
-
-    def fails(self, client, request):
-        with self.lock:
-            self.requests += 1
-            repeated = self.failed.pop(client, None) == request
-            fails = self.requests % 3 == 0 and not repeated
-            if fails:
-                self.failed[client] = request
-            return fails
-
-
-class _Handler(http.server.BaseHTTPRequestHandler):
-    protocol_version = "HTTP/1.1"
-
-    def handle_request(self):
-        length = int(self.headers.get("Content-Length", 0))
-        body = self.rfile.read(length)
-        if len(body) < length:  # the client has ended: an object is stored whole or not at all
-            return None
-        key, objects = unquote(self.path[1:]), self.server.objects
-        if self.server.fails(self.headers["From"], (self.command, self.path)):
-            return self.answer(503)
-        if self.command == "PUT":
-            objects[key] = body
-            self.server.written.append(key)
-        elif key.startswith("?"):
-            found = [each for each in sorted(objects) if each.startswith(key[1:])]
-            return self.answer(200, json.dumps([facts(each, objects[each]) for each in found]).encode())
-        elif key not in objects:
-            return self.answer(404)
-        elif self.command == "DELETE":
-            del objects[key]
-        else:
-            return self.answer(200, objects[key])
-        return self.answer(200)
-
-    do_GET = do_PUT = do_DELETE = handle_request  # noqa: N815
-
-    def answer(self, code, body=b""):
-        self.send_response(code)
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
-
-    def log_message(self, *_):
-        pass
-
-
-def facts(key, data):
-    return {"name": key, "type": "file", "size": len(data), "ETag": hashlib.sha256(data).hexdigest()}
+_requests, _failed = itertools.count(1), set()
 
 
 class LoopbackFileSystem(AbstractFileSystem):
-    """Files of an `ObjectStore` whose port is in the environment."""
+    """Objects as files of the folder that the environment names."""
 
     protocol = "loopback"
     cachable = False
@@ -97,58 +31,67 @@ class LoopbackFileSystem(AbstractFileSystem):
     def _strip_protocol(cls, path):
         return super()._strip_protocol(path).rpartition("@")[2]
 
-    def _ask(self, command, path, data=None):
-        connection = http.client.HTTPConnection("127.0.0.1", int(os.environ[PORT]), timeout=60)
-        with contextlib.closing(connection):
-            client = {"From": f"{os.getpid()} {threading.get_ident()}"}
-            connection.request(command, "/" + quote(path), data, client)
-            answer = connection.getresponse()
-            body = answer.read()
-        if answer.status == 404:
-            raise FileNotFoundError(path)
-        if answer.status != 200:
-            raise RuntimeError(
-                f"the object store answers {answer.status}"
-            )  # as some libraries do: no OSError
-        return body
+    @staticmethod
+    def fails(request):
+        """Whether a request fails: every third one, but not a thread's repetition of it."""
+        if request in _failed:
+            _failed.remove(request)
+            return False
+        if next(_requests) % 3 == 0:
+            _failed.add(request)
+            return True
+        return False
+
+    def _ask(self, command, path):
+        """Return the path of an object, and its file."""
+        path = self._strip_protocol(path)
+        if self.fails((threading.get_ident(), command, path)):
+            raise RuntimeError("the object store answers 503")  # as some libraries do: no OSError
+        return path, Path(os.environ[FOLDER], path)
 
     def _list(self, path):
         """All objects below a path, by one request as in real stores."""
-        path = self._strip_protocol(path)
-        found = json.loads(self._ask("GET", f"?{path}"))
-        return path, [each for each in found if each["name"] == path or each["name"].startswith(f"{path}/")]
+        path, place = self._ask("list", path)
+        root, found = Path(os.environ[FOLDER]), {}
+        for file in sorted(each for each in (place, *place.rglob("*")) if each.is_file()):
+            name, data = file.relative_to(root).as_posix(), file.read_bytes()
+            tag = hashlib.sha256(data).hexdigest()
+            found[name] = {"name": name, "type": "file", "size": len(data), "ETag": tag}
+        return path, found
 
     def find(self, path, maxdepth=None, withdirs=False, detail=False, **_):
         path, found = self._list(path)
         depth = float("inf") if maxdepth is None else maxdepth + path.count("/")
-        found = {each["name"]: each for each in found if each["name"].count("/") <= depth}
-        return found if detail else sorted(found)
+        found = {name: each for name, each in found.items() if name.count("/") <= depth}
+        return found if detail else list(found)
 
     def ls(self, path, detail=True, **_):
         path, found = self._list(path)
         entries = {}
         for each in found:
-            rest = each["name"].removeprefix(f"{path}/")
-            name = each["name"].removesuffix(rest) + rest.partition("/")[0]
-            entries[name] = each if name == each["name"] else {"name": name, "type": "directory", "size": 0}
+            rest = each.removeprefix(f"{path}/")
+            name = each.removesuffix(rest) + rest.partition("/")[0]
+            entries[name] = found.get(name, {"name": name, "type": "directory", "size": 0})
         if not entries:
             raise FileNotFoundError(path)
         return list(entries.values()) if detail else list(entries)
 
     def cat_file(self, path, **_):
-        return self._ask("GET", self._strip_protocol(path))
+        return self._ask("read", path)[1].read_bytes()
 
     def get_file(self, path, target, **_):
-        data = self.cat_file(path)
-        with open(target, "wb") as file:
-            file.write(data)
+        Path(target).write_bytes(self.cat_file(path))
 
     def pipe_file(self, path, value, **_):
-        self._ask("PUT", self._strip_protocol(path), value)
+        """Store an object whole or not at all."""
+        _, file = self._ask("write", path)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=Path(os.environ[FOLDER]).parent, delete=False) as part:
+            part.write(value)
+        os.replace(part.name, file)
 
     def put_file(self, source, path, **_):
-        with open(source, "rb") as file:
-            self.pipe_file(path, file.read())
+        self.pipe_file(path, Path(source).read_bytes())
 
     def rm_file(self, path):
-        self._ask("DELETE", self._strip_protocol(path))
+        self._ask("remove", path)[1].unlink()

@@ -1,17 +1,16 @@
 """Batches that read from and write to storage other than folders."""
 
-import json
 import os
+import shutil
 import signal
-import threading
 import time
 from types import SimpleNamespace
 
 import pytest
 
-from tests.drive.batch_helpers import check_whole, counts, run
+from tests.drive.batch_helpers import check_whole, counts, files, records, run
 from tests.drive.conftest import TRIPS
-from tests.drive.object_store import PORT, SITE, ObjectStore
+from tests.drive.object_store import FOLDER, SITE, LoopbackFileSystem
 from vehicle_detection.drive import batch_status
 from vehicle_detection.drive import batch_trip as plan
 from vehicle_detection.drive.batch_store import open_store
@@ -43,63 +42,50 @@ def test_files_of_a_server_are_listed_with_its_name(monkeypatch):
 
 @pytest.fixture
 def bucket(monkeypatch, tmp_path):
-    """An object store of which every third request fails, also in processes that a test starts."""
-    fsspec.register_implementation("loopback", "tests.drive.object_store.LoopbackFileSystem", clobber=True)
+    """The folder of an object store of which every third request fails, also in processes of a test."""
+    fsspec.register_implementation("loopback", LoopbackFileSystem, clobber=True)
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(SITE)
     path = [str(tmp_path / "site"), *filter(None, [os.environ.get("PYTHONPATH")])]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
     monkeypatch.setattr("vehicle_detection.video.remote._RETRY_DELAYS", (0, 0))
-    with ObjectStore() as store:
-        monkeypatch.setenv(PORT, str(store.server_address[1]))
-        thread = threading.Thread(target=store.serve_forever, kwargs={"poll_interval": 0.02})
-        thread.start()
-        yield store
-        store.shutdown()
-        thread.join()
-
-
-def check_objects(bucket, tmp_path, *, done, failed):
-    """Copy the results from the object store, and check them there."""
-    copy = tmp_path / "copy"
-    for key, data in bucket.objects.items():
-        if key.startswith("results/"):
-            path = copy / key.removeprefix("results/")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
-    return check_whole(copy, done=done, failed=failed)
+    folder = tmp_path / "bucket"
+    (folder / "cam").mkdir(parents=True)
+    monkeypatch.setenv(FOLDER, str(folder))
+    return folder
 
 
 def test_results_in_an_object_store_that_fails_every_third_request(clip, model, tmp_path, bucket):
     for name in ("20260131_081500_F", "20260131_093000_R"):
-        bucket.objects[f"cam/{name}.mp4"] = clip.read_bytes()
-    bucket.objects["cam/20260131_103000_F.mp4"] = clip.read_bytes()[:3000]
+        shutil.copy(clip, bucket / "cam" / f"{name}.mp4")
+    (bucket / "cam" / "20260131_103000_F.mp4").write_bytes(clip.read_bytes()[:3000])
     options = {"sources": "loopback://cam/*.mp4", "out": "loopback://results", "model": model}
     assert counts(run(**options)) == (2, 1, 0, 0)
-    found = check_objects(bucket, tmp_path, done=2, failed=1)
+    found = check_whole(bucket / "results", done=2, failed=1)
     assert {(each["camera"], each["date"]) for each in found.values()} == {
         ("front", "2026-01-31"), ("rear", "2026-01-31")
     }  # fmt: skip
-    assert (tmp_path / "copy" / "videos" / "date=2026-01-31" / "camera=rear").is_dir()
+    assert (bucket / "results" / "videos" / "date=2026-01-31" / "camera=rear").is_dir()
     # Nothing is done twice; a changed object is done again, and its old results are gone.
-    del bucket.written[:]
+    before = files(bucket)
     assert counts(run(**options)) == (0, 0, 0, 3)
-    assert not bucket.written
-    bucket.objects["cam/20260131_093000_R.mp4"] += b"\0" * 8
+    assert files(bucket) == before
+    with (bucket / "cam" / "20260131_093000_R.mp4").open("ab") as file:
+        file.write(b"\0" * 8)
     assert counts(run(**options)) == (1, 0, 0, 2)
     status = batch_status("loopback://results")
     assert (status.done, status.failed, status.frames) == (2, 1, 24)
-    assert len([key for key in bucket.objects if key.startswith("results/tracks")]) == 2
+    assert len(files(bucket / "results" / "tracks")) == 2
     assert not list((tmp_path / "scratch").glob(".vehicle-*"))
 
 
 def test_an_object_store_that_does_not_answer(clip, model, tmp_path, bucket, monkeypatch):
-    bucket.fails = lambda *_: True
+    monkeypatch.setattr(LoopbackFileSystem, "fails", lambda *_: True)
     with pytest.raises(OutputError, match=r"loopback://results/records cannot be listed \(.* 503\); check"):
         run(clip, "loopback://results", model)
     # Only the records answer: the next run repeats the trip.
-    bucket.fails = lambda *_: False
-    monkeypatch.setattr("tests.drive.object_store.LoopbackFileSystem.put_file", refuse)
+    monkeypatch.setattr(LoopbackFileSystem, "fails", lambda *_: False)
+    monkeypatch.setattr(LoopbackFileSystem, "put_file", refuse)
     report = run(clip, "loopback://results", model)
     assert counts(report) == (0, 0, 1, 0)
     assert "cannot be written (no answer)" in next(iter(report.messages.values()))
@@ -112,16 +98,17 @@ def refuse(*_, **__):
 def test_a_killed_batch_with_workers_and_an_object_store(many, model, tmp_path, bucket, start_batch):
     process = start_batch(many, "loopback://results", model, "--tracks-only")
     deadline = time.monotonic() + 300
-    while sum(key.startswith("results/records/") for key in bucket.written) < 2:
+    while len(files(bucket / "results" / "records")) < 2:
         assert time.monotonic() < deadline
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()  # until its workers have ended
-    before = {key: json.loads(data)["started"] for key, data in bucket.objects.items() if "/records/" in key}
+    before = {key: each["started"] for key, each in records(bucket / "results").items()}
     run(many, "loopback://results", model, tracks_only=True)
-    found = check_objects(bucket, tmp_path, done=TRIPS - 1, failed=1)
-    started = {f"results/records/{key}.json": each["started"] for key, each in found.items()}
-    assert before.items() <= started.items(), "a trip was done twice"
+    found = check_whole(bucket / "results", done=TRIPS - 1, failed=1)
+    assert before.items() <= {key: each["started"] for key, each in found.items()}.items(), (
+        "a trip was done twice"
+    )
 
 
 def test_a_store_is_the_same_for_a_folder_and_a_url(tmp_path, bucket):
@@ -147,10 +134,10 @@ def test_a_store_is_the_same_for_a_folder_and_a_url(tmp_path, bucket):
             assert locked
 
 
-def test_passwords_are_neither_stored_nor_printed(clip, model, tmp_path, bucket):
+def test_passwords_are_neither_stored_nor_printed(clip, model, bucket, monkeypatch):
     """The user and password of sources and of the output, in records, errors and the summary."""
-    bucket.fails = lambda *_: False
-    bucket.objects["cam/drive.mp4"] = clip.read_bytes()
+    monkeypatch.setattr(LoopbackFileSystem, "fails", lambda *_: False)
+    shutil.copy(clip, bucket / "cam" / "drive.mp4")
     sources = ["loopback://anna:pa@ss@cam/drive.mp4", "loopback://anna:pa@ss@cam/missing.mp4"]
     out = "loopback://bob:word@results"
     report = run(sources, out, model, tracks_only=True)
@@ -160,13 +147,13 @@ def test_passwords_are_neither_stored_nor_printed(clip, model, tmp_path, bucket)
             "source loopback://***@cam/missing.mp4 does not exist; check the URL"
         )
     }
-    stored = b"".join(data for key, data in bucket.objects.items() if key.startswith("results/"))
+    stored = b"".join(file.read_bytes() for file in files(bucket / "results"))
     for secret in (b"anna", b"ss@", b"bob", b"word"):
         assert secret not in stored
     # A new password changes nothing.
     changed = [source.replace("pa@ss", "new") for source in sources]
     assert counts(run(changed, out, model, tracks_only=True)) == (0, 0, 0, 2)
-    bucket.fails = lambda *_: True
+    monkeypatch.setattr(LoopbackFileSystem, "fails", lambda *_: True)
     with pytest.raises(OutputError, match=r"^loopback://\*\*\*@results/records cannot be listed"):
         batch_status(out)
     with pytest.raises(TransientVideoError, match=r"^loopback://\*\*\*@cam cannot be listed"):
