@@ -1,9 +1,12 @@
 """Helpers shared by the tests."""
 
+import contextlib
 import functools
+import http.server
 import signal
 import subprocess
 import tempfile
+import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,6 +43,40 @@ def start_interruptible(*command, **options):
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def serve(handle):
+    """Serve HTTP requests on the loopback interface by a function of the request; yield the address."""
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            with contextlib.suppress(ConnectionError):
+                handle(self)
+
+        do_HEAD = do_GET  # noqa: N815
+
+        def log_message(self, *_):
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        server.daemon_threads = True
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_address[1]}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def answer(request, status, body=b"", headers=()):
+    """Answer an HTTP request."""
+    request.send_response(status)
+    for name, value in {"Content-Length": len(body), **dict(headers)}.items():
+        request.send_header(name, str(value))
+    request.end_headers()
+    request.wfile.write(body)
 
 
 def _random_template(params, seed, bias):

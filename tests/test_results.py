@@ -1,7 +1,5 @@
 import shutil
 import sys
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from threading import Thread
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +7,7 @@ import pandas as pd
 import pytest
 from PIL import Image, ImageShow
 
+from tests.helpers import answer, serve
 from vehicle_detection import (
     Detections,
     Detector,
@@ -75,19 +74,16 @@ def test_several_images_give_a_list(detector, expected, folder):
 
 
 def test_a_url_is_downloaded(detector, expected, folder):
-    handler = type("Quiet", (SimpleHTTPRequestHandler,), {"log_message": lambda *_: None})
-    server = ThreadingHTTPServer(("127.0.0.1", 0), lambda *args: handler(*args, directory=str(folder)))
-    Thread(target=server.serve_forever, daemon=True).start()
-    address = f"http://127.0.0.1:{server.server_address[1]}"
-    try:
+    def handle(request):
+        file = folder / request.path[1:]
+        answer(request, *((200, file.read_bytes()) if file.exists() else (404,)))
+
+    with serve(handle) as address:
         found = detector.detect(f"{address}/a2.jpg")
         assert found.boxes.tolist() == expected[0].boxes.tolist()
         assert found.path is None
         with pytest.raises(InvalidInputError, match=r"URL .*nothing.jpg does not exist; check the address"):
             detector.detect(f"{address}/nothing.jpg")
-    finally:
-        server.shutdown()
-        server.server_close()
 
 
 def test_what_is_no_image_is_refused(detector, tmp_path, monkeypatch):

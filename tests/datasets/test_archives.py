@@ -1,7 +1,5 @@
-import http.server
 import io
 import os
-import threading
 import time
 from pathlib import Path
 
@@ -10,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.datasets.cases import OTHERS, VEHICLES, png, write_zip
+from tests.helpers import answer, serve
 from vehicle_detection._common import natural_key
 from vehicle_detection.datasets import archives, fetch_patches, load_training_patches
 from vehicle_detection.errors import DatasetError, InvalidInputError
@@ -27,33 +26,22 @@ def test_natural_order_is_the_order_of_the_numbers(numbers):
 # Downloads from a local server
 
 
-class Handler(http.server.BaseHTTPRequestHandler):
-    def do_GET(self):
-        self.server.requests.append(self.path)
-        answer = self.server.answers.get(self.path)
-        if answer is None:
-            self.send_error(404)
-            return
-        body, length = answer
-        self.send_response(200)
-        self.send_header("Content-Length", str(length))
-        self.end_headers()
-        self.wfile.write(body)
-
-    def log_message(self, *args):
-        pass
-
-
-class Server(http.server.ThreadingHTTPServer):
-    """Answers each path of `answers` with a body and the length that it claims to have."""
+class Answers:
+    """Answers each path with a body and the length that it claims to have."""
 
     def __init__(self):
-        super().__init__(("127.0.0.1", 0), Handler)
         self.answers, self.requests = {}, []
-        self.url = f"http://127.0.0.1:{self.server_port}/data"
 
     def put(self, name, body, length=None):
         self.answers[f"/data/{name}"] = (body, len(body) if length is None else length)
+
+    def handle(self, request):
+        self.requests.append(request.path)
+        if request.path in self.answers:
+            body, length = self.answers[request.path]
+            answer(request, 200, body, {"Content-Length": length})
+        else:
+            answer(request, 404)
 
 
 def zip_bytes(members):
@@ -70,14 +58,12 @@ def server(monkeypatch):
         "non-vehicles.zip": {"non-vehicles/Extras": 1, "non-vehicles/GTI": 1},
     }
     monkeypatch.setattr(archives, "ARCHIVES", counts)
-    with Server() as running:
-        running.put("vehicles.zip", zip_bytes(VEHICLES))
-        running.put("non-vehicles.zip", zip_bytes(OTHERS))
-        thread = threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        yield running
-        running.shutdown()
-        thread.join()
+    answers = Answers()
+    answers.put("vehicles.zip", zip_bytes(VEHICLES))
+    answers.put("non-vehicles.zip", zip_bytes(OTHERS))
+    with serve(answers.handle) as address:
+        answers.url = f"{address}/data"
+        yield answers
 
 
 def test_both_archives_are_downloaded_once(server, tmp_path, capsys):
@@ -162,8 +148,8 @@ def test_a_failed_download_changes_no_file(server, tmp_path, case, earlier, capl
 
 
 def test_an_unreachable_server(server, tmp_path):
-    with http.server.HTTPServer(("127.0.0.1", 0), Handler) as closed:
-        url = f"http://127.0.0.1:{closed.server_port}"
+    with serve(server.handle) as url:
+        pass
     with pytest.raises(DatasetError, match=r"vehicles.zip .*\(ConnectionError\); check the network"):
         fetch_patches(tmp_path, url=url, progress=False)
     assert os.listdir(tmp_path) == []

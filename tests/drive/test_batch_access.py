@@ -1,15 +1,15 @@
 """Sources that cannot be read for a while, and URLs that are signed for a while."""
 
 import contextlib
-import http.server
 import os
-import threading
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
+from types import SimpleNamespace
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
 from tests.drive.batch_helpers import check_whole, counts, files, records, run
+from tests.helpers import answer, serve
 from vehicle_detection import run_batch
 from vehicle_detection.drive import batch_trip as plan
 from vehicle_detection.drive import batch_trip as trip
@@ -121,55 +121,35 @@ def test_folders_that_cannot_be_read_are_errors(one, model, tmp_path, monkeypatc
         run(one, out, model, tracks_only=True)
 
 
-class SignedFiles(http.server.BaseHTTPRequestHandler):
-    """Files of a server that answers GET requests with the current signature only."""
-
-    def do_GET(self):
-        parts = urlsplit(self.path)
-        signature = parse_qs(parts.query).get("X-Amz-Signature")
-        data = self.server.files.get(parts.path[1:], b"")
-        if signature != [self.server.signature]:
-            self.send_response(403)
-            self.end_headers()
-            return
-        start, _, end = self.headers.get("Range", "bytes=0-").removeprefix("bytes=").partition("-")
-        part = data[int(start) : int(end) + 1 if end else None]
-        self.send_response(206 if "Range" in self.headers else 200)
-        self.send_header("Content-Range", f"bytes {start}-{int(start) + len(part) - 1}/{len(data)}")
-        self.send_header("Content-Length", str(len(part)))
-        self.send_header("ETag", f'"{hash(data):x}"')
-        self.end_headers()
-        with contextlib.suppress(ConnectionError):
-            self.wfile.write(part)
-
-    def do_HEAD(self):
-        self.send_response(403)
-        self.end_headers()
-
-    def log_message(self, *_):
-        pass
-
-
 @pytest.fixture
 def signed(clip):
-    """A server with two segments of a trip and another drive; `url` signs the URL of a file."""
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), SignedFiles) as server:
-        server.daemon_threads = True
-        names = [f"20260131_{time}_F.mp4" for time in ("081500", "081501", "093000")]
-        server.files = {f"cam/{name}": clip.read_bytes() for name in names}
-        server.signature = "ab12"
+    """A server with two segments of a trip and another drive; `url` signs the URL of a file.
 
-        def url(name, signature):
-            date = "X-Amz-Algorithm=AWS4&X-Amz-Date=20300101T120000Z"
-            host = f"http://127.0.0.1:{server.server_address[1]}"
-            return f"{host}/cam/20260131_{name}_F.mp4?{date}&X-Amz-Signature={signature}"
+    It answers GET requests with the current signature only.
+    """
+    names = [f"20260131_{time}_F.mp4" for time in ("081500", "081501", "093000")]
+    server = SimpleNamespace(files={f"cam/{name}": clip.read_bytes() for name in names}, signature="ab12")
 
-        server.url = url
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-        thread.start()
+    def handle(request):
+        parts = urlsplit(request.path)
+        signature = parse_qs(parts.query).get("X-Amz-Signature")
+        if request.command == "HEAD" or signature != [server.signature]:
+            answer(request, 403)
+            return
+        data = server.files.get(parts.path[1:], b"")
+        start, _, end = request.headers.get("Range", "bytes=0-").removeprefix("bytes=").partition("-")
+        part = data[int(start) : int(end) + 1 if end else None]
+        place = f"bytes {start}-{int(start) + len(part) - 1}/{len(data)}"
+        headers = {"Content-Range": place, "ETag": f'"{hash(data):x}"'}
+        answer(request, 206 if "Range" in request.headers else 200, part, headers)
+
+    def url(name, signature):
+        date = "X-Amz-Algorithm=AWS4&X-Amz-Date=20300101T120000Z"
+        return f"{server.address}/cam/20260131_{name}_F.mp4?{date}&X-Amz-Signature={signature}"
+
+    with serve(handle) as address:
+        server.address, server.url = address, url
         yield server
-        server.shutdown()
-        thread.join()
 
 
 def test_signed_urls_are_the_same_files_when_they_are_signed_again(signed, model, tmp_path):
@@ -205,7 +185,7 @@ def test_a_bad_segment_of_a_server_is_named(signed, model, tmp_path):
     report = run(urls, tmp_path / "out", model, tracks_only=True)
     assert counts(report) == (1, 0, 0, 0)
     (record,) = check_whole(tmp_path / "out", done=1, failed=0).values()
-    named = f"http://127.0.0.1:{signed.server_address[1]}/cam/20260131_081501_F.mp4 is not a video"
+    named = f"{signed.address}/cam/20260131_081501_F.mp4 is not a video"
     assert record["damage"].startswith(f"the last segment is left out: {named}")
 
 

@@ -1,7 +1,6 @@
 """Sources other than single files: segments, images, pipes, network streams and other storage."""
 
 import contextlib
-import http.server
 import os
 import re
 import shutil
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 from moviepy.config import FFMPEG_BINARY
 
-from tests.helpers import ROOT, StubDetector, start_interruptible
+from tests.helpers import ROOT, StubDetector, answer, serve, start_interruptible
 from tests.video.clips import (
     beeps,
     damage_sizes,
@@ -467,40 +466,13 @@ def test_an_interrupt_completes_the_video_of_a_live_source(tmp_path):
 # --- the network ---
 
 
-@contextlib.contextmanager
-def server(handle):
-    """Serve HTTP requests on the loopback interface with a function of the handler."""
-
-    class Handler(http.server.BaseHTTPRequestHandler):
-        def do_GET(self):
-            with contextlib.suppress(ConnectionError):
-                handle(self)
-
-        def log_message(self, *_):
-            pass
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as running:
-        running.daemon_threads = True
-        thread = threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.02})
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{running.server_address[1]}"
-        finally:
-            running.shutdown()
-            thread.join()
-
-
 def test_a_file_on_a_web_server(folder):
     path = write_clip(folder / "web.mp4", gray_frames(20), options=("-movflags", "+faststart"))
 
-    def serve(request):
-        data = path.read_bytes()
-        request.send_response(200 if request.path == "/web.mp4" else 404)
-        request.send_header("Content-Length", str(len(data)))
-        request.end_headers()
-        request.wfile.write(data)
+    def handle(request):
+        answer(request, 200 if request.path == "/web.mp4" else 404, path.read_bytes())
 
-    with server(serve) as address:
+    with serve(handle) as address:
         index, _, seen = numbers(f"{address}/web.mp4")
         with pytest.raises(VideoError, match="404"):
             open_source(f"{address}/other.mp4")
@@ -513,7 +485,7 @@ def test_a_server_that_sends_too_little_fails_at_a_deadline(folder, tmp_path, mo
     data = path.read_bytes()
     whole = [data.find(b"mdat") + 2000]
 
-    def serve(request):
+    def handle(request):
         begin = int((request.headers.get("Range") or "bytes=0-")[6:-1] or 0)
         request.send_response(206 if begin else 200)
         request.send_header("Accept-Ranges", "bytes")
@@ -529,7 +501,7 @@ def test_a_server_that_sends_too_little_fails_at_a_deadline(folder, tmp_path, mo
     monkeypatch.setattr(remote, "_RETRY_DELAYS", (0,))
     for module in (ffmpeg_module, reading, web):
         monkeypatch.setattr(module, "NETWORK_DEADLINE", 1.0)
-    with server(serve) as address:
+    with serve(handle) as address:
         with pytest.raises(TransientVideoError, match=r"slow.mp4 cannot be copied \(only"):
             remote.download(f"{address}/slow.mp4", tmp_path)
         whole[0] = 100
@@ -553,7 +525,7 @@ def stream_of(data):
 
 def test_a_stream_of_a_web_server_ends_with_it(clip, tmp_path):
     data = ffmpeg("-stream_loop", 2, "-i", clip, "-c", "copy", "-an", "-f", "mpegts", "-")
-    with server(stream_of(data)) as address, open_source(f"{address}/live.ts", reconnect=False) as source:
+    with serve(stream_of(data)) as address, open_source(f"{address}/live.ts", reconnect=False) as source:
         assert source.live
         report = process_video(source, tmp_path / "out.mp4", StubDetector())
     assert report.frames + report.dropped == probe_video(tmp_path / "out.mp4").frames == 60
@@ -562,7 +534,7 @@ def test_a_stream_of_a_web_server_ends_with_it(clip, tmp_path):
 @pytest.mark.parametrize("read", [True, False])
 def test_the_first_frame_of_a_live_source_waits_for_its_reader(stream, read):
     with (
-        server(stream_of(stream)) as address,
+        serve(stream_of(stream)) as address,
         open_source(f"{address}/live.ts", reconnect=False) as source,
         source.read() as reader,
     ):
@@ -592,7 +564,7 @@ def test_a_network_stream_that_breaks_off_is_opened_again(clip, tmp_path, monkey
             over.wait(20)
 
     results = []
-    with server(unsteady) as address:
+    with serve(unsteady) as address:
         with open_source(f"{address}/live.ts", live=True) as source:
             report = process_video(source, tmp_path / "out.mp4", StubDetector(), on_result=results.append)
         over.set()
@@ -607,7 +579,7 @@ def test_a_network_stream_that_breaks_off_is_opened_again(clip, tmp_path, monkey
 
 def test_closing_a_stream_ends_its_attempts_to_reconnect(stream, monkeypatch):
     monkeypatch.setattr(live, "_RECONNECT_DELAYS", (600.0,))
-    with server(stream_of(stream)) as address, open_source(f"{address}/live.ts", live=True) as source:
+    with serve(stream_of(stream)) as address, open_source(f"{address}/live.ts", live=True) as source:
         with source.read() as reader:
             assert next(reader)[0] >= 0
             time.sleep(0.3)

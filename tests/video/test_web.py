@@ -2,11 +2,11 @@
 
 import contextlib
 import http.server
-import threading
 import time
 
 import pytest
 
+from tests.helpers import answer, serve
 from tests.video.clips import gray_frames, write_clip
 from vehicle_detection import read_image
 from vehicle_detection._common import web
@@ -21,30 +21,17 @@ HLS = "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:0.2,\n{}\n#EXT-X-ENDLIST\n"
 
 
 @contextlib.contextmanager
-def server(answer):
-    """Serve requests on the loopback interface; `answer` returns status, headers and body for a path."""
+def server(respond):
+    """Serve requests; `respond` returns status, headers and body for a path. Yields address and paths."""
     paths = []
 
-    class Handler(http.server.BaseHTTPRequestHandler):
-        def do_GET(self):
-            paths.append(self.path)
-            status, headers, body = answer(self.path)
-            self.send_response(status)
-            for name, value in {"Content-Length": len(body), **headers}.items():
-                self.send_header(name, str(value))
-            with contextlib.suppress(ConnectionError):
-                self.end_headers()
-                self.wfile.write(body)
+    def handle(request):
+        paths.append(request.path)
+        status, headers, body = respond(request.path)
+        answer(request, status, body, headers)
 
-        def log_message(self, *_):
-            pass
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as running:
-        threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.02}).start()
-        try:
-            yield f"http://127.0.0.1:{running.server_address[1]}", paths
-        finally:
-            running.shutdown()
+    with serve(handle) as address:
+        yield address, paths
 
 
 @pytest.fixture(scope="module")
@@ -55,14 +42,14 @@ def data(folder):
 def refer(kind, target, data):
     """Answer with the video, or at the path /first.m3u8 with a reference to it at another address."""
 
-    def answer(path):
+    def respond(path):
         if path != "/first.m3u8":
             return 200, {}, data
         if kind == "redirect":
             return 302, {"Location": target()}, b""
         return 200, {}, {"HLS": HLS, "DASH": DASH}[kind].format(target()).encode()
 
-    return answer
+    return respond
 
 
 @pytest.mark.parametrize(
