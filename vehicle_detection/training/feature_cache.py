@@ -62,16 +62,13 @@ class FeatureCache:
         """Read features from their file; compute and write them if it is missing or damaged."""
         facts = dataclasses.asdict(params), mirror, vehicle_detection.__version__
         path = self._folder and self._folder / f"{digest_of(self.digest, *facts)}.npy"
-        features = None
         if path and path.exists():
             with contextlib.suppress(OSError, ValueError, EOFError):
-                features = np.asarray(np.load(path, allow_pickle=False))
-        shape = len(self.patches) * (1 + mirror), params.length
-        if features is None or features.shape != shape or features.dtype != np.float32:
-            features = patch_features(self.patches, params, TrainingOptions(mirror=mirror), jobs=self._jobs)
-            if path:
-                content = io.BytesIO()  # unlike `numpy.save`, writing it names the error of a full disk
-                np.save(content, features, allow_pickle=False)
-                with atomic_write(path, "cache") as part:
-                    part.write_bytes(content.getvalue())
+                return np.asarray(np.load(path, allow_pickle=False))
+        features = patch_features(self.patches, params, TrainingOptions(mirror=mirror), jobs=self._jobs)
+        if path:
+            content = io.BytesIO()  # unlike `numpy.save`, writing it names the error of a full disk
+            np.save(content, features, allow_pickle=False)
+            with atomic_write(path, "cache") as part:
+                part.write_bytes(content.getvalue())
         return features

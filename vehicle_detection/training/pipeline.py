@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import asdict, fields, make_dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,12 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, extract_features
 from vehicle_detection.svm import VehicleClassifier
 
+# The fields of `FeatureParams`, not frozen, because scikit-learn sets the parameters of estimators.
+_FIELDS = [(each.name, each.type, each.default) for each in fields(FeatureParams)]
+_Params: Any = make_dataclass("_Params", [*_FIELDS, ("jobs", "int | None", None)], eq=False, kw_only=True)
 
-@dataclass(eq=False, repr=False, kw_only=True)
-class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
+
+class PatchFeatures(TransformerMixin, BaseEstimator, _Params):  # type: ignore[misc]
     """Turn 64x64 patches into feature vectors, for ``Pipeline`` and ``GridSearchCV``.
 
     The parameters are the fields of `FeatureParams`, checked by `fit`, and `jobs` of `extract_features`.
@@ -31,26 +34,6 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     >>> pipeline.fit_transform(np.zeros((2, 64, 64, 3), np.uint8)).shape
     (2, 5388)
     """
-
-    color_space: str = "YCrCb"
-    spatial_color_space: str | None = None
-    hist_color_space: str | None = None
-    spatial_feat: bool = True
-    hist_feat: bool = True
-    hog_feat: bool = True
-    spatial_size: int = 16
-    spatial_order: Literal["channels", "interleaved"] = "channels"
-    hist_bins: int = 32
-    orient: int = 9
-    pix_per_cell: int = 8
-    cell_per_block: int = 2
-    hog_channel: int | Literal["ALL", "GRAY"] = "ALL"
-    transform_sqrt: bool = False
-    hist_sqrt: bool = False
-    coarse_hog: bool = False
-    hist_gain: float = 1.0
-    coarse_gain: float = 1.0
-    jobs: int | None = None
 
     def to_params(self) -> FeatureParams:
         """Return the parameters as checked `FeatureParams`."""

@@ -92,19 +92,13 @@ def write_results(table: DataFrame, path: str | os.PathLike[str]) -> None:
 
 def check_replaceable(path: str | os.PathLike[str], name: str) -> None:
     """Raise if a file exists that is no table of trials or searches, before one is written in its place."""
-    import pandas as pd
-
     file = Path(path)
     if not file.is_file() or not file.stat().st_size:
         return
     try:
-        if file.suffix.lower() == ".parquet":
-            columns = set(import_pyarrow().parquet.read_schema(file).names)
-        elif file.suffix.lower() == ".csv":
-            columns = set(pd.read_csv(file, nrows=0).columns)
-        else:
-            columns = set(_read_lines(file)[1][0])
-    except (DatasetError, LookupError, OSError, ValueError):
+        parquet = file.suffix.lower() == ".parquet"
+        columns = set(import_pyarrow().parquet.read_schema(file).names if parquet else read_results(file))
+    except (DatasetError, OSError, ValueError):
         columns = set()
     if not any(own <= columns for own in ({"configuration", "accuracy"}, {"scales", "f1"})):
         raise InvalidInputError(f"{name} {file} exists and is no table of tune; choose another file")
@@ -168,32 +162,25 @@ class RowStore(dict[str, Mapping[str, Any]]):
     def add(self, row: Mapping[str, Any]) -> None:
         """Store a finished row."""
         self[row["trial"]] = row
-        if self._path is None:
-            return
-        with self._path.open("a+b") as file:
-            file.seek(0)
-            # Another run may have measured it at the same time; `read_results` drops what it still writes.
-            if str(row["trial"]).encode() in file.read():
-                return
-            file.write(_format_row({name: row.get(name) for name in self._columns}).encode())
-            file.flush()
-            os.fsync(file.fileno())
+        if self._path is not None:
+            with self._path.open("ab") as file:
+                file.write(_format_row({name: row.get(name) for name in self._columns}).encode())
+                file.flush()
+                os.fsync(file.fileno())
 
 
 def _format_row(row: Mapping[Any, Any]) -> str:
     """Format a row as a line of JSON, in which NaN is null."""
-    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
     values = {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in plain.items()
+        for name, value in row.items()
     }
-    return json.dumps(values, ensure_ascii=False) + "\n"
+    return json.dumps(values, ensure_ascii=False, default=np.generic.item) + "\n"
 
 
-def _read_lines(file: os.PathLike[str]) -> tuple[bytes, list[dict[str, Any]]]:
+def _read_lines(file: Path) -> tuple[bytes, list[dict[str, Any]]]:
     """Bytes and rows of a file up to its last line break: a killed writer leaves an incomplete line."""
-    with open(file, "rb") as opened:
-        data = opened.read()
+    data = file.read_bytes()
     text, rows = data[: data.rfind(b"\n") + 1], []
     for number, line in enumerate(text.splitlines(), start=1):
         try:

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 import logging
 import math
 import os
 import time
+import timeit
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -86,8 +88,7 @@ class TrialOptions:
     jobs: int | None = None  #: threads of the feature extraction
 
     def __post_init__(self) -> None:
-        if self.frames is not None:  # a generator can be read only once
-            object.__setattr__(self, "frames", self.frame_sets)
+        object.__setattr__(self, "frames", self.frame_sets)  # a generator can be read only once
         for each in self.frame_sets:
             if not isinstance(each, LabelledFrames):
                 raise InvalidInputError(f"frames must be LabelledFrames, one or more; got {describe(each)}")
@@ -354,14 +355,14 @@ def _check_names(options: Mapping[str, Any], name: str) -> None:
 
 def _make_candidate(name: str | None, options: Mapping[str, Any]) -> Candidate:
     features = {key: value for key, value in options.items() if key not in _TRAINING}
-    training = {key: options[key] for key in _TRAINING}
     try:
-        params, fitting = FeatureParams(**features), TrainingOptions(**training)
+        params = FeatureParams(**features)
+        training = TrainingOptions(**{key: options[key] for key in _TRAINING})
     except InvalidInputError as error:
-        return Candidate(name or _join_options(features), {**features, **training}, error=str(error))
+        return Candidate(name or _join_options(features), dict(options), error=str(error))
     columns = {**dataclasses.asdict(params), "n_features": params.length}
-    columns |= {key: getattr(fitting, key) for key in _TRAINING}
-    return Candidate(name or _describe_params(params), columns, params, fitting)
+    columns |= {key: getattr(training, key) for key in _TRAINING}
+    return Candidate(name or _describe_params(params), columns, params, training)
 
 
 def _describe_params(params: FeatureParams) -> str:
@@ -483,34 +484,28 @@ class Trials:
         """Mean of each metric over the sets of frames, and the F1 score of each set as text."""
         import pandas as pd
 
-        scores = {each.name: self._score_set(classifier, each) for each in self._options.frame_sets}
+        rows = {}
+        for frames in self._options.frame_sets:
+            search = self._options.search_params.with_horizon(frames.horizon)
+            regions = self._options.region_params
+            with Detector(classifier, search_params=search, region_params=regions) as detector:
+                found = TrackTable.from_detections({key: detector.detect(image) for key, image in frames})
+            scores = evaluate_detections(found, frames.labels, frames=frames.keys)
+            best, _ = best_f1(*precision_recall_curve(found, frames.labels))
+            rows[frames.name] = scores.f1, best, scores.average_precision, scores.mean_iou
+        by_set = "; ".join(f"{name} {f1:.4f}" for name, (f1, *_) in rows.items())
         # The mean of a metric without any value is NaN.
-        means = pd.DataFrame(scores, _FRAME_METRICS).mean(axis=1)
-        by_set = "; ".join(f"{name} {f1:.4f}" for name, (f1, *_) in scores.items())
-        return {**means, "frame_f1_by_set": by_set}
-
-    def _score_set(self, classifier: VehicleClassifier, frames: LabelledFrames) -> tuple[float, ...]:
-        """Values of `_FRAME_METRICS` on a set of frames."""
-        search = self._options.search_params.with_horizon(frames.horizon)
-        regions = self._options.region_params
-        with Detector(classifier, search_params=search, region_params=regions) as detector:
-            found = TrackTable.from_detections({key: detector.detect(image) for key, image in frames})
-        scores = evaluate_detections(found, frames.labels, frames=frames.keys)
-        best, _ = best_f1(*precision_recall_curve(found, frames.labels))
-        return scores.f1, best, scores.average_precision, scores.mean_iou
+        return {**pd.DataFrame(rows, _FRAME_METRICS).mean(axis=1), "frame_f1_by_set": by_set}
 
     def _time_search(self, classifier: VehicleClassifier) -> float:
         """Milliseconds of the fast search of a 1280x720 frame on one core: the fastest of several runs."""
         if classifier.params not in self._search_ms:
             frame = np.random.default_rng(0).integers(0, 256, (*_TIMED_SHAPE, 3), np.uint8)
-            seconds = []
             with contextlib.closing(classifier.open_search(jobs=1)) as search:
+                run = functools.partial(search.find, frame, self._options.search_params)
                 # The first run compiles kernels and allocates buffers.
-                for _ in range(_TIMED_RUNS + 1):
-                    start = time.perf_counter()
-                    search.find(frame, self._options.search_params)
-                    seconds.append(time.perf_counter() - start)
-            self._search_ms[classifier.params] = round(min(seconds[1:]) * 1000, 3)
+                _, *seconds = timeit.repeat(run, number=1, repeat=_TIMED_RUNS + 1)
+            self._search_ms[classifier.params] = round(min(seconds) * 1000, 3)
         return self._search_ms[classifier.params]
 
 
