@@ -10,7 +10,7 @@ from onnx import helper
 from tests.network.graphs import own_network, serialize
 from vehicle_detection.errors import DetectorError, InvalidInputError, ModelFileError
 from vehicle_detection.network import load_network, open_session
-from vehicle_detection.network.runtime import _prefers_openvino
+from vehicle_detection.network.runtime import _multiplies_matrices
 
 NO_OPENVINO = importlib.util.find_spec("openvino") is None
 RUNTIMES = [
@@ -30,14 +30,14 @@ def test_a_session_runs_inputs_of_any_size(runtime):
     session.close()
 
 
-def test_openvino_is_chosen_for_matrix_units_only(tmp_path):
+def test_matrix_units_are_recognized(tmp_path):
     file = tmp_path / "cpuinfo"
-    assert not _prefers_openvino(file)
+    assert not _multiplies_matrices(file)
     file.write_text("flags : fpu avx2 avx512_vnni")
-    assert not _prefers_openvino(tmp_path / "." / "cpuinfo")
+    assert not _multiplies_matrices(tmp_path / "." / "cpuinfo")
     amx = tmp_path / "amx"
     amx.write_text("flags : fpu amx_bf16 amx_tile amx_int8")
-    assert _prefers_openvino(amx) is not NO_OPENVINO
+    assert _multiplies_matrices(amx)
 
 
 def test_the_libraries_are_imported_on_first_use():

@@ -95,11 +95,15 @@ def test_the_result_depends_on_nothing_but_the_frame(model):
 
 @pytest.mark.skipif(NO_OPENVINO, reason="openvino is not installed")
 def test_both_libraries_find_the_same(file, model):
-    one, other = find(model), find(load_network(file, runtime="openvino"))
-    assert len(one.windows) == len(other.windows)
-    np.testing.assert_allclose(one.vehicles.boxes, other.vehicles.boxes, atol=0.5)
-    first, second = (model.calibration.probability(each.vehicles.scores) for each in (one, other))
-    np.testing.assert_allclose(first, second, atol=0.02)
+    found = [find(model).windows, find(load_network(file, runtime="openvino")).windows]
+    for one, other in found, found[::-1]:
+        # Those with scores next to the threshold may be below it in the other one.
+        boxes, scores = one.boxes[one.scores > 0.1], one.scores[one.scores > 0.1]
+        distances = np.abs(boxes[:, None] - other.boxes).max(-1)
+        assert len(boxes) > 100
+        assert distances.min(1).max() <= 0.5
+        first, second = map(model.calibration.probability, (scores, other.scores[distances.argmin(1)]))
+        np.testing.assert_allclose(first, second, atol=0.02)
 
 
 @pytest.mark.parametrize("runtime", RUNTIMES)

@@ -7,10 +7,19 @@ onnx = pytest.importorskip("onnx", reason="export needs onnx, the extra [train]"
 from tests.training.networks import random_network  # noqa: E402
 from vehicle_detection.errors import ModelFileError  # noqa: E402
 from vehicle_detection.network import load_network, open_session  # noqa: E402
-from vehicle_detection.training import TrainingFrame, export_network, load_content, read_weights, set_metadata  # noqa: E402
+from vehicle_detection.training import (  # noqa: E402
+    TrainingFrame,
+    export,
+    export_network,
+    load_content,
+    read_weights,
+    set_metadata,
+)
+from vehicle_detection.training.pixel_groups import narrow, widen  # noqa: E402
 
 PARAMS = {"input_size": 640, "slope": 1.5, "offset": -0.5, "threshold": 0.25, "nms_iou": 0.6}
 IMAGE = np.random.default_rng(0).integers(0, 256, (96, 160, 3), np.uint8)
+FRAMES = [TrainingFrame(IMAGE, np.zeros((0, 4)), np.zeros((0, 4)), "road")]
 
 
 @pytest.fixture(scope="module")
@@ -20,9 +29,8 @@ def network():
 
 @pytest.fixture(scope="module")
 def files(network):
-    frames = [TrainingFrame(IMAGE, np.zeros((0, 4)), np.zeros((0, 4)), "road")]
     return {
-        quantize: export_network(network, frames, PARAMS, {"note": "random"}, quantize=quantize)
+        quantize: export_network(network, FRAMES, PARAMS, {"note": "random"}, quantize=quantize)
         for quantize in (False, True)
     }
 
@@ -55,6 +63,22 @@ def test_the_quantized_file_is_close_and_a_quarter_of_the_size(files):
     assert len(files[True]) < 4e6
 
 
+@pytest.mark.parametrize("quantize", [False, True])
+def test_groups_of_pixels_change_no_result(quantize, network, files, monkeypatch):
+    monkeypatch.setattr(export, "group_pixels", lambda graph: None)
+    single = run(export_network(network, FRAMES, PARAMS, {}, quantize=quantize))
+    np.testing.assert_allclose(run(files[quantize]), single, atol=0 if quantize else 1e-3, rtol=1e-4)
+
+
+def test_kernels_on_groups_of_pixels():
+    kernel = np.arange(4 * 3 * 9).reshape(4, 3, 3, 3)
+    for pixels in 2, 4:
+        wide = widen(kernel, pixels)
+        assert wide.shape == (4 * pixels // 2, 3 * pixels, 3, 2)
+        assert wide.sum() == kernel.sum() * pixels // 2
+        np.testing.assert_array_equal(narrow(wide, 3), kernel)
+
+
 def test_parameters_and_facts_are_in_the_file(files, tmp_path):
     path = tmp_path / "own.onnx"
     path.write_bytes(files[True])
@@ -66,8 +90,7 @@ def test_parameters_and_facts_are_in_the_file(files, tmp_path):
 
 
 def test_the_file_is_the_same_again(network, files):
-    frames = [TrainingFrame(IMAGE, np.zeros((0, 4)), np.zeros((0, 4)), "road")]
-    assert export_network(network, frames, PARAMS, {"note": "random"}) == files[True]
+    assert export_network(network, FRAMES, PARAMS, {"note": "random"}) == files[True]
 
 
 # --- read_weights ---

@@ -66,7 +66,9 @@ def open_session(
     """
     n_threads = resolve_jobs(jobs)
     check_device(device, runtime)
-    if device == "cpu" and (runtime == "openvino" or (runtime == "auto" and _prefers_openvino())):
+    has_openvino = importlib.util.find_spec("openvino") is not None
+    is_faster = runtime == "auto" and has_openvino and _multiplies_matrices()
+    if device == "cpu" and (runtime == "openvino" or is_faster):
         return _OpenVinoSession(graph, name, n_threads)
     return _OnnxSession(graph, name, n_threads, device)
 
@@ -103,13 +105,12 @@ def check_device(device: Device, runtime: Runtime) -> None:
 
 
 @functools.cache
-def _prefers_openvino(cpu_info: Path = Path("/proc/cpuinfo")) -> bool:
-    """Whether OpenVINO is installed and faster; without importing it."""
+def _multiplies_matrices(cpu_info: Path = Path("/proc/cpuinfo")) -> bool:
+    """Whether the processor multiplies bfloat16 and 8-bit matrices."""
     try:
-        has_matrices = "amx_tile" in cpu_info.read_text()
+        return "amx_tile" in cpu_info.read_text()
     except OSError:  # not Linux
         return False
-    return has_matrices and importlib.util.find_spec("openvino") is not None
 
 
 def _onnx_session(graph: bytes, name: str, n_threads: int, device: Device, *, optimize: bool = True) -> Any:
@@ -156,7 +157,13 @@ class _OpenVinoSession:
         import openvino
 
         self._name, self._core = name, openvino.Core()
-        self._config = {"INFERENCE_NUM_THREADS": n_threads, "NUM_STREAMS": 1, "ENABLE_CPU_PINNING": False}
+        self._config: dict[str, Any] = {
+            "INFERENCE_NUM_THREADS": n_threads,
+            "NUM_STREAMS": 1,
+            "ENABLE_CPU_PINNING": False,
+        }
+        if not _multiplies_matrices():  # bfloat16 is no faster there, and less exact
+            self._config["INFERENCE_PRECISION_HINT"] = "f32"
         self._model = _open(name, lambda: self._core.read_model(graph, b""))
         self._lock = threading.Lock()
         # By the shapes of the inputs: a compiled model and its idle requests.

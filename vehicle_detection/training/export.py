@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from vehicle_detection.network import FORMAT_VERSION, METADATA_KEY
 from vehicle_detection.training.architecture import CENTER, SCALE, Deployed, Network
 from vehicle_detection.training.frames import TrainingFrame
+from vehicle_detection.training.pixel_groups import group_pixels
 
 _OPSET = 17
 _CALIBRATION_SIZE = 640, 352  # px
@@ -61,6 +62,7 @@ def export_network(
             _quantize(plain, prepared, small, frames)
         model = onnx.load(small if quantize else plain)
     _take_bytes(model)
+    group_pixels(model.graph)
     model.producer_name, model.producer_version, model.doc_string = "vehicle_detection", "", ""
     onnx.checker.check_model(model)
     return set_metadata(model.SerializeToString(), params, metadata)

@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from vehicle_detection.errors import ModelFileError
 from vehicle_detection.training.architecture import STRIDES, Network
+from vehicle_detection.training.pixel_groups import narrow
 
 
 def read_weights(graph: bytes, name: str) -> Network:
@@ -33,7 +35,7 @@ def read_weights(graph: bytes, name: str) -> Network:
         with torch.no_grad():
             _set_convolutions(network, constants)
             network.scale.copy_(torch.tensor(_level_scales(constants)))
-    except (LookupError, RuntimeError, ValueError) as error:
+    except (ArithmeticError, LookupError, RuntimeError, ValueError) as error:
         raise ModelFileError(
             f"{name} is not a network of this version's architecture ({error}); train from the model "
             "'default', or from a file that train-frames of this version has written"
@@ -77,7 +79,9 @@ def _set_convolutions(network: Network, constants: _Constants) -> None:
             read[_module_name(node.name)] = [constants.array(each) for each in node.input[1:]]
     for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d):
-            kernel, bias = (torch.from_numpy(each.copy()) for each in read.pop(name))
+            kernel, bias = read.pop(name)
+            if kernel.shape[2:] == (3, 2):  # on groups of pixels
+                kernel, bias = narrow(kernel, module.in_channels), bias[: module.out_channels]
             _copy(module.weight, kernel, name)
             parent, _, index = name.rpartition(".")
             target = module
@@ -91,8 +95,9 @@ def _set_convolutions(network: Network, constants: _Constants) -> None:
         raise LookupError(f"unknown convolution {min(read)}")
 
 
-def _copy(target: torch.Tensor | None, value: torch.Tensor, name: str) -> None:
+def _copy(target: torch.Tensor | None, array: NDArray[np.float32], name: str) -> None:
     assert target is not None
+    value = torch.from_numpy(array.copy())
     if target.shape != value.shape:
         raise ValueError(f"{name} has the shape {tuple(value.shape)}, expected {tuple(target.shape)}")
     if not bool(torch.isfinite(value).all()):
