@@ -1,6 +1,7 @@
 """Helpers shared by the tests."""
 
 import contextlib
+import errno
 import functools
 import http.server
 import signal
@@ -43,6 +44,26 @@ def start_interruptible(*command, **options):
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def wait_until(condition, seconds=60):
+    """Wait until a condition holds."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def failing(error):
+    """Make a function that raises an error, whatever its arguments."""
+
+    def fail(*_, **__):
+        raise error
+
+    return fail
+
+
+FULL_DISK = failing(OSError(errno.ENOSPC, "No space left on device"))
 
 
 @contextlib.contextmanager

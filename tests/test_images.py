@@ -1,4 +1,3 @@
-import errno
 import io
 import itertools
 import os
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.helpers import FULL_DISK
 from vehicle_detection.errors import InvalidInputError, OutputError
 from vehicle_detection.images import decode_image, image_size, read_image, write_image
 
@@ -198,12 +198,8 @@ def test_a_failed_write_keeps_the_earlier_file(tmp_path, picture, monkeypatch):
     monkeypatch.setattr(cv2, "imencode", lambda *_: (False, None))
     with pytest.raises(InvalidInputError, match=r"image cannot be encoded as .png; choose another format"):
         write_image(tmp_path / "a.png", 255 - picture)
-
-    def fill(self, data):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     monkeypatch.undo()
-    monkeypatch.setattr(Path, "write_bytes", fill)
+    monkeypatch.setattr(Path, "write_bytes", FULL_DISK)
     with pytest.raises(OutputError, match=r"a.png cannot be written \(No space left on device\); free some"):
         write_image(tmp_path / "a.png", 255 - picture)
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]

@@ -15,7 +15,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
-from tests.helpers import random_classifier
+from tests.helpers import failing, random_classifier
 from vehicle_detection._common import FORMAT_VERSION, blur_patches, degrade_patches, mirror_patches
 from vehicle_detection._common.model_file import FORMAT, checksum
 from vehicle_detection._kernels import fit_svm
@@ -396,12 +396,8 @@ def test_a_missing_model_file(tmp_path, monkeypatch):
         load_classifier(tmp_path / "nothing")
     with pytest.raises(ModelFileError, match=r"model file .* is a folder; choose a file in it"):
         load_classifier(tmp_path)
-
-    def refuse(self, mode):
-        raise PermissionError(13, "Permission denied")
-
     (tmp_path / "locked").touch()
-    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(Path, "open", failing(PermissionError(13, "Permission denied")))
     with pytest.raises(ModelFileError, match=r"model file .* cannot be read: Permission denied"):
         load_classifier(tmp_path / "locked")
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers import FULL_DISK, failing
 from vehicle_detection._common import atomic_write, check_target, temporary_folder
 from vehicle_detection.errors import InvalidInputError, OutputError
 
@@ -71,10 +72,7 @@ def test_an_interrupt_leaves_no_temporary_file_and_keeps_the_existing_one(tmp_pa
 
 
 def test_a_failed_rename_leaves_no_file(tmp_path, monkeypatch):
-    def refuse(self, target):
-        raise PermissionError("not yours")
-
-    monkeypatch.setattr(Path, "replace", refuse)
+    monkeypatch.setattr(Path, "replace", failing(PermissionError("not yours")))
     message = r"out.csv cannot be written \(not yours\); check the folder, or choose another"
     with pytest.raises(OutputError, match=message), atomic_write(tmp_path / "out.csv") as part:
         part.write_text("whole")
@@ -122,9 +120,6 @@ def test_concurrent_writers_of_one_file_do_not_mix(tmp_path):
     assert names(tmp_path) == ["out.txt"]
 
 
-FULL = OSError(errno.ENOSPC, "No space left on device")
-
-
 @pytest.mark.parametrize("earlier", [None, "earlier"])
 def test_a_full_disk_names_the_output(tmp_path, earlier):
     target = tmp_path / "out.csv"
@@ -133,16 +128,13 @@ def test_a_full_disk_names_the_output(tmp_path, earlier):
     kept = "; the existing file is unchanged" if earlier else ""
     message = rf"out.csv cannot be written \(No space left on device\); free some space{kept}$"
     with pytest.raises(OutputError, match=message), atomic_write(target):
-        raise FULL
+        FULL_DISK()
     assert names(tmp_path) == (["out.csv"] if earlier else [])
 
 
 def test_no_space_for_a_new_file(tmp_path, monkeypatch):
-    def refuse(*_, **__):
-        raise FULL
-
-    monkeypatch.setattr(os, "open", refuse)
-    monkeypatch.setattr(os, "mkdir", refuse)
+    monkeypatch.setattr(os, "open", FULL_DISK)
+    monkeypatch.setattr(os, "mkdir", FULL_DISK)
     with pytest.raises(OutputError, match=r"out.csv cannot be written"), atomic_write(tmp_path / "out.csv"):
         pass
     with pytest.raises(OutputError, match="demo cannot be written"), temporary_folder(tmp_path, "demo"):
@@ -209,9 +201,7 @@ def test_a_link_with_the_name_of_a_temporary_file_is_not_followed(tmp_path):
 
 
 def test_a_file_system_without_locks_and_permissions(tmp_path, monkeypatch):
-    def refuse(*_, **__):
-        raise PermissionError(errno.EPERM, "Operation not permitted")
-
+    refuse = failing(PermissionError(errno.EPERM, "Operation not permitted"))
     monkeypatch.setattr("fcntl.flock", refuse)
     monkeypatch.setattr(Path, "chmod", refuse)
     with atomic_write(tmp_path / "out.csv") as part, temporary_folder(tmp_path, "demo") as folder:

@@ -45,15 +45,6 @@ def start_changed(code, *words):
     return start_interruptible(sys.executable, "-c", f"{code}\n{tail}", *words)
 
 
-def failing(error):
-    """Make a function that raises an error, whatever its arguments."""
-
-    def fail(*_, **__):
-        raise error
-
-    return fail
-
-
 def finish(process):
     out, errors = process.communicate(timeout=300)
     return process.returncode, out, errors

@@ -17,7 +17,6 @@ import pytest
 
 from tests.cli.commands import (
     contents,
-    failing,
     finish,
     patches_of,
     refuse,
@@ -25,7 +24,7 @@ from tests.cli.commands import (
     start_changed,
     write_patches,
 )
-from tests.helpers import ROOT
+from tests.helpers import ROOT, failing, wait_until
 from tests.video.clips import gray_frames, write_clip
 from vehicle_detection import detector
 from vehicle_detection._kernels.jit import jit
@@ -94,10 +93,7 @@ def test_a_killed_run_leaves_no_process_and_the_next_one_removes_its_files(clip,
     process.communicate()
     parts = contents(tmp_path)
     assert parts == [".out.0.part.csv", ".out.0.part.mp4"]
-    deadline = time.monotonic() + 60
-    while processes_with(tmp_path) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert not processes_with(tmp_path)
+    wait_until(lambda: not processes_with(tmp_path))
     words = ["-o", tmp_path / "out.mp4", "--tracks", tmp_path / "out.csv", "--model", "highway", "-q"]
     assert run("video", clip, *words).exit_code == 0
     assert contents(tmp_path) == ["out.csv", "out.mp4"]

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.cli.commands import HEADER, contents, refuse, refuse_each, run, succeed
+from tests.helpers import failing
 from tests.video.clips import damage_sizes, write_clip
 from vehicle_detection import video
 from vehicle_detection.annotator import DrawParams
@@ -253,10 +254,7 @@ BAD_CAMERAS = {
 
 
 def test_video_refuses_bad_input_and_changes_no_file(material, clip, tmp_path, monkeypatch):
-    def fail(*_, **__):
-        raise AssertionError("estimated")
-
-    monkeypatch.setattr(video, "estimate_video_horizon", fail)
+    monkeypatch.setattr(video, "estimate_video_horizon", failing(AssertionError("estimated")))
     monkeypatch.chdir(tmp_path)
     for name, size, frames in (("tiny.mp4", (32, 32), 3), ("none.mp4", (64, 64), 0)):
         writer = cv2.VideoWriter(name, cv2.VideoWriter.fourcc(*"mp4v"), 25, size)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.datasets.cases import OTHERS, VEHICLES, png, write_zip
-from tests.helpers import answer, serve
+from tests.helpers import FULL_DISK, answer, serve
 from vehicle_detection._common import natural_key
 from vehicle_detection.datasets import archives, fetch_patches, load_training_patches
 from vehicle_detection.errors import DatasetError, InvalidInputError
@@ -97,10 +97,6 @@ def test_the_default_folder_is_the_user_cache(server, tmp_path, monkeypatch):
     assert vehicles == tmp_path / "vehicle_detection" / "vehicles.zip"
 
 
-def replaced(members, old, new):
-    return {new if name == old else name: data for name, data in members.items()}
-
-
 def with_member(name, data=b""):
     return zip_bytes({**OTHERS, name: data})
 
@@ -181,10 +177,7 @@ def test_verified_archives_in_a_read_only_folder_are_used(server, tmp_path, monk
 
 
 def test_a_full_disk(server, tmp_path, monkeypatch):
-    def full(*args):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("pooch.HTTPDownloader.__call__", full)
+    monkeypatch.setattr("pooch.HTTPDownloader.__call__", FULL_DISK)
     with pytest.raises(DatasetError, match=r"cannot be stored in .*: No space .*on device; free some space"):
         fetch_patches(tmp_path, url=server.url, progress=False)
     assert os.listdir(tmp_path) == []

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.drive.batch_helpers import check_whole, counts, files, records, run
-from tests.helpers import write_network
+from tests.helpers import FULL_DISK, failing, write_network
 from tests.video.clips import damage_sizes
 from vehicle_detection import process_video, run_batch
 from vehicle_detection.cli.app import app
@@ -179,12 +179,8 @@ def test_the_record_of_a_damaged_file_says_what_is_missing(clip, model, tmp_path
 
 def test_a_full_disk_is_an_error_that_the_next_run_repeats(card, model, tmp_path, monkeypatch):
     source, out = str(card / "*0930*"), tmp_path / "out"
-
-    def fill(*_):
-        raise OSError(28, "No space left on device")
-
     with monkeypatch.context() as patch:
-        patch.setattr(store.Store, "publish", fill)
+        patch.setattr(store.Store, "publish", FULL_DISK)
         report = run(source, out, model)
     assert counts(report) == (0, 0, 1, 0)
     assert "No space left" in next(iter(report.messages.values()))
@@ -235,10 +231,7 @@ def test_an_ffmpeg_without_resources_is_an_error_and_a_crashed_one_a_failure(
     ],
 )
 def test_what_the_machine_is_to_blame_for_is_an_error(card, model, tmp_path, monkeypatch, error, status):
-    def fail(*_, **__):
-        raise error
-
-    monkeypatch.setattr(trip_module, "process_video", fail)
+    monkeypatch.setattr(trip_module, "process_video", failing(error))
     run(str(card / "*0930*"), tmp_path / "out", model)
     assert [record["status"] for record in records(tmp_path / "out").values()] == [status]
 
@@ -470,10 +463,7 @@ def test_an_unknown_lens_has_one_warning(card, model, tmp_path):
 
 @pytest.mark.usefixtures("in_process")
 def test_a_log_that_cannot_be_written_does_not_end_a_batch(card, model, tmp_path, monkeypatch):
-    def fill(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("vehicle_detection.cli.batch.print_error", fill)
+    monkeypatch.setattr("vehicle_detection.cli.batch.print_error", FULL_DISK)
     words = ["batch", "-o", tmp_path / "out", "--tracks-only", "--model", model, "--fov", 90, card]
     CliRunner().invoke(app, [str(word) for word in words])
     assert len(records(tmp_path / "out")) == 3

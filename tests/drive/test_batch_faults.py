@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from multiprocessing import resource_tracker
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import pytest
 
 from tests.drive.batch_helpers import check_whole, counts, files, records, run, unfinished
 from tests.drive.conftest import TRIPS
-from tests.helpers import ROOT
+from tests.helpers import ROOT, wait_until
 from tests.video.clips import child_processes
 from vehicle_detection import run_batch
 from vehicle_detection.drive import batch_status, open_dask
@@ -35,15 +34,8 @@ def finish(process):
     return process.returncode, out, errors
 
 
-def wait_until(condition):
-    deadline = time.monotonic() + 300
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
 def wait_for_records(out, number):
-    wait_until(lambda: len(records(out)) >= number)
+    wait_until(lambda: len(records(out)) >= number, 300)
 
 
 def processes_below(pid):
@@ -184,7 +176,7 @@ def test_a_killed_scheduler_ends_the_run_and_the_next_one_does_the_rest(
     words = ["--scheduler-file", file, "--no-dashboard"]
     scheduler = start("-m", "distributed.cli.dask_scheduler", "--port", 0, *words)
     worker = start("-m", "distributed.cli.dask_worker", *words, "--nthreads", 1, "--death-timeout", 20)
-    wait_until(lambda: file.exists() and file.read_text().endswith("}"))
+    wait_until(lambda: file.exists() and file.read_text().endswith("}"), 300)
     address = json.loads(file.read_text())["address"]
     with unfinished(out, last_of(many)):
         process = start_batch(many, out, model, "--tracks-only", "--dask", address)

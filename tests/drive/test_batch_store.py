@@ -3,7 +3,6 @@
 import os
 import shutil
 import signal
-import time
 from types import SimpleNamespace
 
 import pytest
@@ -11,6 +10,7 @@ import pytest
 from tests.drive.batch_helpers import check_whole, counts, files, records, run
 from tests.drive.conftest import TRIPS
 from tests.drive.object_store import FOLDER, SITE, LoopbackFileSystem
+from tests.helpers import failing, wait_until
 from vehicle_detection.drive import batch_status
 from vehicle_detection.drive import batch_trip as plan
 from vehicle_detection.drive.batch_store import open_store
@@ -85,22 +85,15 @@ def test_an_object_store_that_does_not_answer(clip, model, tmp_path, bucket, mon
         run(clip, "loopback://results", model)
     # Only the records answer: the next run repeats the trip.
     monkeypatch.setattr(LoopbackFileSystem, "fails", lambda *_: False)
-    monkeypatch.setattr(LoopbackFileSystem, "put_file", refuse)
+    monkeypatch.setattr(LoopbackFileSystem, "put_file", failing(ConnectionResetError("no answer")))
     report = run(clip, "loopback://results", model)
     assert counts(report) == (0, 0, 1, 0)
     assert "cannot be written (no answer)" in next(iter(report.messages.values()))
 
 
-def refuse(*_, **__):
-    raise ConnectionResetError("no answer")
-
-
 def test_a_killed_batch_with_workers_and_an_object_store(many, model, tmp_path, bucket, start_batch):
     process = start_batch(many, "loopback://results", model, "--tracks-only")
-    deadline = time.monotonic() + 300
-    while len(files(bucket / "results" / "records")) < 2:
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_until(lambda: len(files(bucket / "results" / "records")) >= 2, 300)
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()  # until its workers have ended
     before = {key: each["started"] for key, each in records(bucket / "results").items()}

@@ -6,6 +6,7 @@ from urllib.parse import unquote
 import pytest
 
 from tests.drive.report_helpers import FRAMES, StrictParser, video_report, write_report
+from tests.helpers import FULL_DISK
 from vehicle_detection.drive import ReportWriter
 from vehicle_detection.drive import report as page
 from vehicle_detection.drive import report as writer
@@ -83,13 +84,9 @@ def test_an_earlier_page_stays_if_a_new_one_fails(tmp_path, monkeypatch):
         report.finish(video_report(1))
     with pytest.raises(InvalidInputError, match="report must be a VideoReport, got None"):
         report.finish(None)
-
-    def fail(*_):
-        raise OSError("the disk is full")
-
-    monkeypatch.setattr(page.VideoEmbed, "base64_chunks", fail)
+    monkeypatch.setattr(page.VideoEmbed, "base64_chunks", FULL_DISK)
     report = ReportWriter(tmp_path / "report.html", video=video)
-    with pytest.raises(OSError, match="the disk is full"):
+    with pytest.raises(OSError, match="No space left"):
         report.finish(video_report(1))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "video.mp4"]
     assert (tmp_path / "report.html").read_text(encoding="utf-8") == before

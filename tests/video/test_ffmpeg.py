@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
 
-from tests.helpers import ROOT, StubDetector, start_interruptible
+from tests.helpers import ROOT, StubDetector, failing, start_interruptible, wait_until
 from tests.video.clips import NTSC, child_processes, ffmpeg, ffmpeg_log, gray_frames, write_clip
 from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video import probe_video, process_video, read_frames
@@ -109,20 +109,15 @@ def test_a_missing_ffmpeg(clip, monkeypatch):
     "error", [OSError(errno.EMFILE, "Too many open files"), RuntimeError("can't start new thread")]
 )
 def test_an_ffmpeg_that_cannot_be_started_for_now(clip, monkeypatch, error):
-    def fail(*_, **__):
-        raise error
-
-    monkeypatch.setattr("subprocess.Popen", fail)
+    monkeypatch.setattr("subprocess.Popen", failing(error))
     with pytest.raises(TransientVideoError, match=r"ffmpeg cannot be started .*; close other programs, or"):
         probe_video(clip)
 
 
 def test_a_platform_without_an_ffmpeg_of_imageio(clip, monkeypatch):
-    def fail():
-        raise RuntimeError("No ffmpeg exe could be found.")
-
     monkeypatch.delitem(sys.modules, "moviepy.config", raising=False)
     monkeypatch.delenv("FFMPEG_BINARY", raising=False)
+    fail = failing(RuntimeError("No ffmpeg exe could be found."))
     monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", fail)
     with pytest.raises(VideoError, match="no ffmpeg program was found; install ffmpeg, or set FFMPEG_BINARY"):
         probe_video(clip)
@@ -166,10 +161,7 @@ signal.pause()
     assert is_running(child)
     process.kill()
     process.communicate()
-    deadline = time.monotonic() + 60
-    while is_running(child) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert not is_running(child)
+    wait_until(lambda: not is_running(child))
 
 
 def is_running(number):
@@ -190,10 +182,7 @@ def test_an_interrupt_while_ffmpeg_starts_leaves_no_process(clip, monkeypatch):
     monkeypatch.setattr("concurrent.futures.Future.result", interrupt)
     with pytest.raises(KeyboardInterrupt):
         Process(("-f", "lavfi", "-i", "testsrc", "-f", "null", "-"))
-    deadline = time.monotonic() + 60
-    while child_processes() != before and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert child_processes() == before
+    wait_until(lambda: child_processes() == before)
 
 
 def test_reasons_of_signals():
