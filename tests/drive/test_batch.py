@@ -180,7 +180,7 @@ def test_the_record_of_a_damaged_file_says_what_is_missing(clip, model, tmp_path
 def test_a_full_disk_is_an_error_that_the_next_run_repeats(card, model, tmp_path, monkeypatch):
     source, out = str(card / "*0930*"), tmp_path / "out"
     with monkeypatch.context() as patch:
-        patch.setattr(store.Store, "publish", FULL_DISK)
+        patch.setattr(store.shutil, "copyfile", FULL_DISK)
         report = run(source, out, model)
     assert counts(report) == (0, 0, 1, 0)
     assert "No space left" in next(iter(report.messages.values()))

@@ -89,11 +89,11 @@ def test_a_linked_folder_in_the_results_is_refused(tmp_path):
     (tmp_path / "out").symlink_to(tmp_path / "real")  # the folder itself may be a link
     (tmp_path / "out" / "records").symlink_to(tmp_path / "elsewhere")
     store = open_store(tmp_path / "out")
-    for call in (lambda: store.remove("records/a.json"), lambda: store.write("records/a.json", b""),
+    for call in (lambda: store.remove("records/a.json"), lambda: store.put("records/a.json", b""),
                  lambda: store.list_files("records"), lambda: store.read("records/a.json")):  # fmt: skip
         with pytest.raises(OutputError, match="leads through a link"):
             call()
-    store.write("tracks/a", b"x")
+    store.put("tracks/a", b"x")
     assert (tmp_path / "real" / "tracks" / "a").read_bytes() == b"x"
     assert (tmp_path / "elsewhere" / "a.json").read_text() == "precious"
 

@@ -112,9 +112,9 @@ def test_a_store_is_the_same_for_a_folder_and_a_url(tmp_path, bucket):
         assert not opened.exists("tracks/x")
         assert opened.read("tracks/x") is None
         assert opened.list_files("tracks") == []
-        opened.publish(file, "tracks/day/ab-1.txt")
-        opened.write("tracks/day/cd-2.txt", b"small")
-        opened.write("tracks/day/cd-2.txt", b"smaller")
+        opened.put("tracks/day/ab-1.txt", file)
+        opened.put("tracks/day/cd-2.txt", b"small")
+        opened.put("tracks/day/cd-2.txt", b"smaller")
         assert sorted(opened.list_files("tracks")) == ["tracks/day/ab-1.txt", "tracks/day/cd-2.txt"]
         assert opened.list_files("tracks/day", "ab-") == ["tracks/day/ab-1.txt"]
         paths = ["tracks/day/ab-1.txt", "tracks/missing", "tracks/day/cd-2.txt"]

@@ -8,7 +8,7 @@ import os
 import queue
 import re
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -49,7 +49,6 @@ from vehicle_detection.drive.batch_trip import (
     list_videos,
     open_detector,
     plan_trip,
-    remove_replaced,
     run_trip,
     shipped_model,
     source_id,
@@ -216,8 +215,8 @@ def run_batch(
     if dry_run:
         planned = tuple({name: task[name] for name in _PLANNED} for task in pending)
         pending, superseded, progress = [], [], False
-    for task, record in superseded:
-        remove_replaced(store, task, record)
+    for task in superseded:
+        run_trip(task)
     with contextlib.ExitStack() as stack:
         if executor is None and pending:
             warm = warm_up, (settings, fingerprint_of(settings))
@@ -264,20 +263,22 @@ def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -
         name = os.path.abspath(name)
     check.instance(options, "options", Mapping | None, "pass a dictionary")
     given = dict(options or {})
-    for key, value in given.items():  # a path or a number of NumPy
-        if isinstance(value, (os.PathLike, np.generic)):
-            given[key] = os.fspath(value) if isinstance(value, os.PathLike) else value.item()
     camera = given.get("camera")
-    if isinstance(camera, str) and os.path.isfile(camera):
+    if isinstance(camera, (str, os.PathLike)) and os.path.isfile(camera):
         given["camera"] = os.path.abspath(camera)
-    settings = {"model": name, "options": given, **others}
     try:
-        json.dumps(settings)
-        open_detector(name, **given).close()  # an error now, not in every worker
+        text = json.dumps({"model": name, "options": given, **others}, default=_plain)
+        settings: dict[str, Any] = json.loads(text)
+        open_detector(name, **settings["options"]).close()  # an error now, not in every worker
     except TypeError as error:
         names = "classes, device, conf, camera, fov, camera_height, horizon, every or blur"
         raise InvalidInputError(f"options must be values of JSON for {names}; {error}") from None
     return settings
+
+
+def _plain(value: Any) -> Any:
+    """Value of JSON for a number of NumPy or a path."""
+    return value.item() if isinstance(value, np.generic) else os.fsdecode(value)
 
 
 def _plan(
@@ -360,10 +361,10 @@ def _without_recorded(
 
 def _pending(
     tasks: Iterable[dict[str, Any]], store: Store, retry_failed: bool
-) -> tuple[list[dict[str, Any]], list[tuple[dict[str, Any], dict[str, Any]]]]:
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Select the trips that are missing, incomplete or, with `retry_failed`, have failed.
 
-    Also returns complete trips, with their records, that still have earlier results to be removed.
+    Also returns complete trips that still have earlier results to be removed.
     """
     records = read_records(store, (task["key"] for task in tasks if task["recorded"]))
     outputs = {path for kind in ("tracks", "videos") for path in store.list_files(kind)} if records else set()
@@ -371,45 +372,47 @@ def _pending(
     for task in tasks:
         record = records.get(task["key"])
         again = retry_failed and record is not None and record["status"] == FAILED
+        task["again"] = again
         if again or not is_complete(record, outputs.__contains__):
-            pending.append({**task, "again": again})
-        elif record is not None and task["replaces"]:  # such as an error while the source was away
-            superseded.append((task, record))
+            pending.append(task)
+        elif task["replaces"]:  # such as an error while the source was away
+            superseded.append(task)
     return pending, superseded
 
 
 def _run(
-    executor: Executor | None, pending: Iterable[dict[str, Any]], store: Store
+    executor: Executor | None, pending: Sequence[dict[str, Any]], store: Store
 ) -> Generator[dict[str, Any]]:
     """Yield the record of each trip; closing it cancels those that have not begun."""
     attempts: Counter[str] = Counter()
+    left = {task["key"]: task for task in pending}
+    waiting, busy = list(pending), list[dict[str, Any]]()  # to be submitted; processed by other runs
     running: dict[Future[Any], dict[str, Any]] = {}
     finished: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
-    waiting, busy = deque(pending), list[dict[str, Any]]()  # not submitted; processed by other runs
     try:
-        while waiting or running or busy:
-            while waiting:
+        while left:
+            for task in waiting:
                 assert executor is not None
-                future = executor.submit(run_trip, waiting[0])
-                running[future] = waiting.popleft()
+                future = executor.submit(run_trip, task)
+                running[future] = task
                 future.add_done_callback(finished.put)
+            waiting = []
             if not running:
                 time.sleep(_BUSY_INTERVAL)
-                waiting, busy = deque(busy), []
+                waiting, busy = busy, []
                 continue
             future = finished.get()
-            task = running[future]
+            task = running.pop(future)
             record = _outcome(future, task, attempts, store)
-            # Not before: if the pool is broken, `_outcome` raises, and the task must still be in `running`.
-            del running[future]
             if record is None:
                 waiting.append(task)
             elif record["status"] == BUSY:
                 busy.append(task)
             else:
+                del left[task["key"]]
                 yield record
     except BrokenExecutor as error:  # such as a scheduler that was killed: the next run does the rest
-        for task in (*waiting, *running.values(), *busy):
+        for task in left.values():
             # Not recorded: a trip without a record is repeated.
             yield _error_record(task, hide_credentials(f"{error}")) | {"new": True}
     finally:

@@ -91,7 +91,7 @@ def open_store(out: object, *, create: bool = False, exists: bool = True) -> Sto
 class Store:
     """The results of a batch: files by their path relative to a folder or URL, with ``/``.
 
-    A published file is complete or absent: object stores show an uploaded file when it is complete, and in a
+    A written file is complete or absent: object stores show an uploaded file when it is complete, and in a
     folder it is renamed to its place. A request to remote storage is repeated if it fails.
     """
 
@@ -126,19 +126,18 @@ class Store:
         return f"{self._root}/{path}"
 
     def exists(self, path: str) -> bool:
-        """Whether there is a file."""
-        if self._folder:
-            return _is_file(self._path(path))
+        """Whether there is a file, which is not a link to one."""
 
-        def find() -> None:
+        def find() -> Mapping[str, Any]:
             self._filesystem.invalidate_cache()
-            self._filesystem.info(self._path(path))
+            info: Mapping[str, Any] = self._filesystem.info(self._path(path))
+            return info
 
         try:
-            self._request(f"/{path} cannot be found", find)
+            info = self._request(f"/{path} cannot be found", find)
         except FileNotFoundError:
             return False
-        return True
+        return info["type"] == "file" and not info.get("islink")
 
     def read(self, path: str) -> bytes | None:
         """Content of a file; None if there is none."""
@@ -184,33 +183,26 @@ class Store:
         named = ((path, path.rpartition("/")[2]) for path in paths)
         return [path for path, name in named if name.startswith(prefix) and not name.startswith(".")]
 
-    def publish(self, file: Path, path: str) -> None:
-        """Copy a complete local file."""
-        copy = functools.partial(shutil.copyfile, file)
-        self._put(path, copy, functools.partial(self._filesystem.put_file, str(file)))
-
-    def write(self, path: str, data: bytes) -> None:
-        """Write a small file."""
-        self._put(
-            path, lambda part: part.write_bytes(data), lambda target: self._filesystem.pipe_file(target, data)
-        )
-
-    def _put(self, path: str, copy: Callable[[Path], object], upload: Callable[[str], object]) -> None:
-        """Write a file: in a folder by `copy` to a temporary file, in remote storage by `upload`."""
+    def put(self, path: str, content: Path | bytes) -> None:
+        """Write a file, from a complete local file or from its content."""
         target, what = self._path(path), f"/{path} cannot be written"
         if self._folder:
             Path(target).parent.mkdir(parents=True, exist_ok=True)
             if os.path.islink(target):  # replaced, not followed
                 os.unlink(target)
             with atomic_write(target) as part:
-                copy(part)
+                part.write_bytes(content) if isinstance(content, bytes) else shutil.copyfile(content, part)
             return
+        if isinstance(content, bytes):
+            upload = functools.partial(self._filesystem.pipe_file, target, content)
+        else:
+            upload = functools.partial(self._filesystem.put_file, str(content), target)
         try:
-            self._request(what, lambda: upload(target))
+            self._request(what, upload)
         except FileNotFoundError:  # object stores need no folders, other storages do
             folder = target.rpartition("/")[0]
             self._request(what, lambda: self._filesystem.makedirs(folder, exist_ok=True))
-            self._request(what, lambda: upload(target))
+            self._request(what, upload)
 
     def remove(self, path: str) -> None:
         """Remove a file, if it is there."""
@@ -244,13 +236,6 @@ class Store:
             except BlockingIOError:
                 locked = False
             yield locked
-
-
-def _is_file(path: str | os.PathLike[str]) -> bool:
-    """Whether a path is a regular file, and not a link to one."""
-    with contextlib.suppress(OSError, ValueError):
-        return stat.S_ISREG(os.lstat(path).st_mode)
-    return False
 
 
 def _read_file(path: str) -> bytes | None:
@@ -374,7 +359,7 @@ def _key(path: str) -> str:
 
 def write_record(store: Store, record: Mapping[str, Any]) -> None:
     """Write the record of a trip."""
-    store.write(record_path(record["key"]), (json.dumps(record, indent=1) + "\n").encode())
+    store.put(record_path(record["key"]), (json.dumps(record, indent=1) + "\n").encode())
 
 
 def is_complete(record: Mapping[str, Any] | None, exists: Callable[[str], bool]) -> bool:
@@ -433,16 +418,15 @@ def batch_summary(out: str | os.PathLike[str]) -> pandas.DataFrame:
     """
     import pandas
 
-    rows = [_summary_row(key, record) for key, record in read_records(open_store(out)).items()]
+    rows = [_summary_row(record) for record in iterate_records(open_store(out))]
     rows.sort(key=lambda row: (row["date"] or "", row["camera"] or "", row["first_file"]))
     return pandas.DataFrame(rows, columns=_SUMMARY_COLUMNS)
 
 
-def _summary_row(key: str, record: Mapping[str, Any]) -> dict[str, Any]:
+def _summary_row(record: Mapping[str, Any]) -> dict[str, Any]:
     sources, outputs = record["sources"], record["outputs"]
-    row: dict[str, Any] = {**dict.fromkeys(_SUMMARY_COLUMNS), **record}
-    row |= {"key": key, "first_file": sources[0]["uri"], "files": len(sources)}
+    row = {**record, "first_file": sources[0]["uri"], "files": len(sources)}
     row |= {f"{kind}_file": outputs.get(kind) for kind in ("tracks", "video")}
     row["work_seconds"] = record.get("seconds")
-    listed = {name: row[name] for name in _SUMMARY_COLUMNS}
+    listed = {name: row.get(name) for name in _SUMMARY_COLUMNS}
     return {name: encodable(value) if isinstance(value, str) else value for name, value in listed.items()}

@@ -322,35 +322,40 @@ def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
     """Process a trip of `plan_trip` and return its record, in which ``new`` is True if it was processed now.
 
     Only one process works on a trip at a time. Outputs are complete or absent, and the record is written
-    last.
+    last. What a complete trip replaces is removed.
     """
+    key = task["key"]
     try:
-        return _run_locked(open_store(task["out"], create=True), task)
+        store = open_store(task["out"], create=True)
+        with store.lock(identity_of(key)) as locked:
+            if not locked:
+                return {"key": key, "status": BUSY, "sources": task["sources"]}
+            record = read_records(store, [key]).get(key)
+            if record is None or task["again"] or not is_complete(record, store.exists):
+                return _run_locked(store, task) | {"new": True}
+            _remove_earlier(store, task, record)
+            return record | {"new": False}
     except OutputError as error:  # no access, or a file in `out` that is not the batch's
         return {name: task[name] for name in RECORDED} | _failure(error) | {"new": True}
 
 
 def _run_locked(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
-    key = task["key"]
-    with store.lock(identity_of(key)) as locked:
-        if not locked:
-            return {"key": key, "status": BUSY, "sources": task["sources"]}
-        record = read_records(store, [key]).get(key)
-        if record is not None and is_complete(record, store.exists) and not task.get("again"):
-            return record | {"new": False}
-        started = time.time()
-        record = {name: task[name] for name in RECORDED}
-        record |= {"version": __version__, "host": platform.node(), "started": started}
-        try:
-            record |= _replace(store, task)
-        except Exception as error:
-            record |= _failure(error)
-        record["seconds"] = round(time.time() - started, 3)
-        try:
-            write_record(store, record)
-        except (OSError, InvalidInputError) as error:  # a full disk, no access: the next run repeats the trip
-            record |= {"status": ERROR, "message": str(error)}
-    return record | {"new": True}
+    """Process a trip, remove what it replaces, and write its record."""
+    started = time.time()
+    record = {name: task[name] for name in RECORDED}
+    record |= {"version": __version__, "host": platform.node(), "started": started}
+    try:
+        record |= _process(store, task)
+    except Exception as error:
+        record |= _failure(error)
+    record["seconds"] = round(time.time() - started, 3)
+    try:
+        if record["status"] != ERROR:  # an error of the machine replaces nothing
+            _remove_earlier(store, task, record)
+        write_record(store, record)
+    except (OSError, InvalidInputError) as error:  # a full disk, no access: the next run repeats the trip
+        record |= {"status": ERROR, "message": str(error)}
+    return record
 
 
 def _failure(error: Exception) -> dict[str, Any]:
@@ -360,28 +365,6 @@ def _failure(error: Exception) -> dict[str, Any]:
         return {"status": ERROR, "message": f"{type(error).__name__}: {message}"}
     passing = isinstance(error, (TransientVideoError, OSError))  # an OutputError is an OSError
     return {"status": ERROR if passing else FAILED, "message": message}
-
-
-def remove_replaced(store: Store, task: Mapping[str, Any], record: Mapping[str, Any]) -> None:
-    """Remove what a complete trip has replaced, which another run may have written in the meantime."""
-    with store.lock(identity_of(task["key"])) as locked:
-        if locked:
-            _remove_earlier(store, task, record)
-
-
-def _replace(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
-    """Process a trip, then remove what it replaces; an error of the machine removes nothing.
-
-    A source that cannot be processed replaces no results.
-    """
-    try:
-        facts = _process(store, task)
-    except Exception as error:
-        facts = _failure(error)
-        if facts["status"] == ERROR:
-            return facts
-    _remove_earlier(store, task, facts)
-    return facts
 
 
 def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
@@ -408,8 +391,8 @@ def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
         outputs = {"tracks": f"tracks/{place}.parquet"}
         if video is not None:  # the larger file first, for which there may be no space
             outputs["video"] = f"videos/{place}.mp4"
-            store.publish(video, outputs["video"])
-        store.publish(folder / "tracks.parquet", outputs["tracks"])
+            store.put(outputs["video"], video)
+        store.put(outputs["tracks"], folder / "tracks.parquet")
     return {
         "status": DONE,
         "frames": report.frames,
