@@ -119,16 +119,9 @@ def test_report_writes_json_and_keeps_other_benchmarks(tmp_path):
     _report.write_json({"second": [Row("count", 4)]}, file)
     found = json.loads(file.read_text(encoding="utf-8"))
     assert found["benchmarks"]["first"] == [
-        {
-            "what": "time",
-            "measured": 1.25,
-            "unit": "s",
-            "target": "<= 1",
-            "verdict": "missed",
-            "material": "drawn",
-            "details": {"n": 3},
-        }
-    ]
+        {"what": "time", "measured": 1.25, "unit": "s", "target": "<= 1", "verdict": "missed",
+         "material": "drawn", "details": {"n": 3}}
+    ]  # fmt: skip
     assert found["benchmarks"]["second"][0]["verdict"] is None
     assert found["machine"]["cores"] >= 1
     assert {"numpy", "numba"} <= set(found["machine"]["libraries"])

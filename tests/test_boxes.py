@@ -221,11 +221,7 @@ def test_detections_of_supervision_are_converted():
         ([TWO], {}, "detections must have the attributes xyxy"),
         (StandIn(TWO, [0.5, 3.0]), {}, r'0 to 1 with score="probability", got 0.5 to 3; pass score="logit"'),
         (StandIn([[9, 9, 5, 5]], [0.5]), {}, "x1 <= x2"),
-        (
-            StandIn(TWO, [0.5, 0.5]),
-            {"class_ids": [1]},
-            "class_ids needs an integer class for each of 2 boxes",
-        ),
+        (StandIn(TWO, [0.5, 0.5]), {"class_ids": [1]}, "class_ids needs an integer class for each of 2"),
         (StandIn(TWO, [0.5, 0.5], [2, 7]), {"class_ids": 2}, "class_ids must be a sequence of integers"),
         (StandIn(TWO), {"score": (1, 1)}, r"score\[1\] must be a number, greater than 1"),
         (StandIn(TWO), {"score": (0, 1), "threshold": 0.5}, "threshold must be omitted"),

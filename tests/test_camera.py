@@ -213,10 +213,7 @@ def test_a_camera_file_by_hand(tmp_path):
         ("[1]", r"camera file .+ must be an object with the names of read_camera, got"),
         ('{"zoom": 1}', r"must be an object with the names .*; got zoom"),
         ('{"focal_px": 900}', r"camera.json: focal_px needs image_size"),
-        (
-            '{"focal_px": 900, "lens": "wide-90", "image_size": [1280, 720]}',
-            "must hold lens or focal_px, not both",
-        ),
+        ('{"focal_px": 900, "lens": "wide-90", "image_size": [1280, 720]}', "lens or focal_px, not both"),
         ('{"fov": 150, "lens": "wide-90"}', "must hold fov or lens, not both"),
         ('{"focal_px": 900, "image_size": 1280}', r"image_size must be \[width, height\], got 1280"),
         ('{"fov": 900}', r"camera.json: fov must be a number"),
@@ -316,31 +313,23 @@ def test_calibrations_of_opencv_and_ros(distortion, fisheye, suffix, ros, tmp_pa
     assert open_camera(path, height_m=1.5, horizon=0.5).height_m == 1.5
 
 
+def ros(matrix, distortion=""):
+    return ROS.format(matrix=matrix, model="", count=len(distortion.split(",")), distortion=distortion)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
         ("a.yaml", "camera_matrix: {data: [1, 2]}", "must hold image_width, image_height"),
-        ("a.yaml", ROS.format(matrix="1, " * 9, model="", count=0, distortion=""), "fit the image"),
-        ("a.yaml", ROS.format(matrix="900,0,640,0,500,360,0,0,1", model="", count=0, distortion=""), "agree"),
-        (
-            "a.yaml",
-            ROS.format(matrix="900,0,640,0,900,360,0,0,1", model="", count=2, distortion="-9,50"),
-            "fits",
-        ),
-        (
-            "a.yaml",
-            ROS.format(matrix="900,0,640,0,.nan,360,0,0,1", model="", count=0, distortion=""),
-            "finite",
-        ),
-        (
-            "a.yaml",
-            ROS.format(matrix="900,0,640,0,0,360,0,0,1", model="", count=6, distortion="1e308,1e308,0,0,0,9"),
-            "finite",
-        ),
+        ("a.yaml", ros("1, " * 9), "fit the image"),
+        ("a.yaml", ros("900,0,640,0,500,360,0,0,1"), "agree"),
+        ("a.yaml", ros("900,0,640,0,900,360,0,0,1", "-9,50"), "fits"),
+        ("a.yaml", ros("900,0,640,0,.nan,360,0,0,1"), "finite"),
+        ("a.yaml", ros("900,0,640,0,0,360,0,0,1", "1e308,1e308,0,0,0,9"), "finite"),
         (
             "a.json",
-            '{"image_width": Infinity, "image_height": 720, "camera_matrix": {"data": []}}',
-            "must hold image_width",
+            '{"image_width": Infinity, "image_height": 720, "camera_matrix": {}}',
+            "must hold image_w",
         ),
         ("a.yaml", "a: [", "is not YAML"),
         ("a.yaml", "a: !!bool of", "is not YAML"),

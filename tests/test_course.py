@@ -56,20 +56,17 @@ def trained(X, y=LABELS, clf=None, scaler=None):
     return clf.fit(scaler.transform(X), y), scaler
 
 
+HOG_OF_YUV = {"color_space": "YUV", "orient": 11, "pix_per_cell": 16, "hog_channel": "ALL"}
+HOG_OF_YUV |= {"spatial_feat": False, "hist_feat": False}
+
+
 @pytest.fixture(scope="module")
 def models():
     """Options of `extract_features` and a classifier for them, trained on uint8 and on float 0-1 patches."""
     found = {}
     for name, options in {
         "all": {"color_space": "YCrCb", "spatial_size": (16, 16), "hist_bins": 16, "hog_channel": "ALL"},
-        "hog": {
-            "color_space": "YUV",
-            "orient": 11,
-            "pix_per_cell": 16,
-            "hog_channel": "ALL",
-            "spatial_feat": False,
-            "hist_feat": False,
-        },
+        "hog": HOG_OF_YUV,
         "luv": {"color_space": "LUV", "spatial_size": (16, 16), "hist_bins": 16, "orient": 8},
         "color": {"color_space": "HSV", "spatial_size": (8, 8), "hist_bins": 8, "hog_feat": False},
     }.items():
@@ -505,9 +502,7 @@ def test_histograms_of_another_range_warn(color_space):
     if len(UNIT_CHANNELS[color_space]) == 3:
         calls["histogram"] = lambda hist: lesson.color_hist(unit, 32, hist)
     for name, call in calls.items():
-        with pytest.warns(
-            UserWarning, match=r'in the first bin .*0-256.*imread="cv2".*divide_by=1'
-        ) as caught:
+        with pytest.warns(UserWarning, match='first bin .*imread="cv2".*divide_by=1') as caught:
             call((0, 256))
         assert {warning.filename for warning in caught} == {__file__}, name
         with warnings.catch_warnings(record=True) as caught:
@@ -726,10 +721,7 @@ def test_every_call_form_binds(call_data, form, shape):
     [
         ("get_hog_features(d.patch, 9, 8, 2)", "one .H, W. channel"),
         ("get_hog_features(d.gray[:9], 9, 8, 2)", "at least one block large .16x16 pixels.; got 64x9"),
-        (
-            "get_hog_features(-d.float_patch[..., 0], 9, 8, 2, transform_sqrt=True)",
-            "transform_sqrt must be False",
-        ),
+        ("get_hog_features(-d.float_patch[..., 0], 9, 8, 2, transform_sqrt=True)", "transform_sqrt must be"),
         ("bin_spatial(d.gray, 'HLS', 8)", "color_space must be RGB for one channel; got 'HLS'"),
         ("bin_spatial(d.patch, 8, 8)", "takes an image and a size; got 1 more"),
         ("color_hist(d.patch, 4, (5, 5))", "bins_range must be a number, greater than 5"),
@@ -738,10 +730,7 @@ def test_every_call_form_binds(call_data, form, shape):
         ("extract_features(d.patch)", r"list of images, .*pass \[image\], or use single_img_features"),
         ("extract_features([d.patch, d.gray])", r"imgs\[1\] must be an .H, W, 3. RGB array"),
         ("extract_features(iter([d.patch, d.patch.astype(int)]))", r"imgs\[1\] must be uint8 or float"),
-        (
-            "extract_features(d.patches, 'YCrCb', 9, 8, 2, 1)",
-            "HOG quiz .*: cspace='YCrCb', orient=9, pix_per_cell=8, cell_per_block=2, hog_channel=1",
-        ),
+        ("extract_features(d.patches, 'YCrCb', 9, 8, 2, 1)", "HOG quiz .*: cspace='YCrCb', .*hog_channel=1"),
         ("extract_features(['missing.png'])", "does not exist"),
         ("extract_features(d.files, spatial_feat=0, hist_feat=0, hog_feat=0)", "all False"),
         ("slide_window(d.image, [9, 5])", "0 <= start <= stop"),
@@ -750,10 +739,7 @@ def test_every_call_form_binds(call_data, form, shape):
         ("search_windows(d.image, [((330, 0), (340, 9))], d.svc, d.scaler, **d.options)", "330x208 image"),
         ("search_windows(d.image, d.boxes, d.svc, d.scaler)", "fitted on 6108 features, but these options"),
         ("search_windows(d.image, d.boxes, d.scaler, d.svc)", "classifier must have a method predict"),
-        (
-            "find_cars(d.image, 90, 200, 1, d.svc, StandardScaler(), 9, 8, 2, 16, 16)",
-            "scaler must be fitted; got an unfitted StandardScaler",
-        ),
+        ("find_cars(d.image, 90, 200, 1, d.svc, StandardScaler(), 9, 8, 2, 16, 16)", "scaler must be fitted"),
         ("find_cars(d.image, 90, 90, 1, d.svc, d.scaler, 9, 8, 2, 16, 16)", "ystart and ystop"),
         ("find_cars(d.image, 90, 200, 1, d.svc, d.scaler, 9, 64, 2, 16, 16)", "must fit into a window"),
         ("find_cars(d.image, 9, 99, 1, d.svc, d.scaler, 9, 8, 2, 16, 16, resize='first')", "resize must be"),
@@ -826,9 +812,7 @@ def test_labels_of_any_kind_and_number():
     frame = FRAMES["uint8"]
     windows = lesson.find_car_windows(frame, 0, 80, 1, Listing(), None, 9, 8, 2, (32, 32), 32, divide_by=1)
     assert len(windows) == ((frame.shape[1] // 8 - 1) - 7) // 2
-    with pytest.raises(
-        InvalidInputError, match=r"must predict a label for each of .* from Constant\.predict"
-    ):
+    with pytest.raises(InvalidInputError, match=r"must predict a label for each .*Constant\.predict"):
         lesson.find_car_windows(frame, 0, 80, 1, Constant(), None, 9, 8, 2, (32, 32), 32, divide_by=1)
 
 

@@ -277,8 +277,6 @@ def test_the_first_write_up_finds_its_windows(real_data, some_real_patches):
     assert 5 < len(hot) < 30  # 18 with all patches in the order of the files
     assert accuracy > 0.95
     units = list(patches[::2].astype(np.float32) / 255)
-    with pytest.warns(
-        UserWarning, match="the scaler was fitted on values 0-1, but the image has values 0-255"
-    ):
+    with pytest.warns(UserWarning, match="fitted on values 0-1, but the image has values 0-255"):
         hot, *_ = hot_windows(units, labels[::2])
     assert len(hot) > 120

@@ -15,16 +15,8 @@ from tests.helpers import ROOT
 from vehicle_detection import __version__
 
 NAME = f"vehicle_detection-{__version__}"
-SOURCES = {
-    "vehicle_detection",
-    "benchmarks",
-    "docs",
-    "notebooks",
-    "requirements",
-    "test_images",
-    "tests",
-    "tools",
-}
+SOURCES = {"vehicle_detection", "benchmarks", "docs", "notebooks", "requirements", "tests", "tools"}
+SOURCES |= {"test_images"}
 TEXTS = {"README.md", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "SECURITY.md", "LICENSE"}
 TEXTS |= {"CODE_OF_CONDUCT.md"}
 

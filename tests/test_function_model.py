@@ -196,16 +196,9 @@ def test_a_function_has_the_interface_of_a_model():
     assert explorer.render().shape == (*SHAPE, 3)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"score": (0, 1), "threshold": 0.5}, "threshold must be omitted with"),
-    ],
-)
-def test_invalid_arguments_are_rejected(options, message):
-    options = {"function": find_red, **options}
-    with pytest.raises(InvalidInputError, match=message):
-        detector_from(options.pop("function"), **options)
+def test_a_threshold_is_refused_beside_a_range_of_scores():
+    with pytest.raises(InvalidInputError, match="threshold must be omitted with"):
+        detector_from(find_red, score=(0, 1), threshold=0.5)
 
 
 def test_boxes_as_fractions_of_the_frame_are_rejected():

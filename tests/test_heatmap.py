@@ -171,10 +171,7 @@ ONES, WINDOW = np.ones((3, 3)), [[0, 0, 1, 1]]
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (
-            lambda: add_heat(np.zeros((3, 4, 3)), []),
-            r"heatmap must be an \(H, W\) .*got .*numpy.zeros\(image",
-        ),
+        (lambda: add_heat(np.zeros((3, 4, 3)), []), r"heatmap must be .*numpy.zeros\(image"),
         (lambda: add_heat(READ_ONLY, []), "heatmap must be writable, because it is changed in place"),
         (lambda: add_heat(np.zeros((3, 3)), WINDOW * 2, scores=[1.0]), "scores must be"),
         (lambda: apply_threshold(READ_ONLY, 1), "heatmap must be writable"),

@@ -22,12 +22,7 @@ TREES = {name: ast.parse(path.read_text()) for name, path in FILES.items()}
 # Everything else is the core, which imports from none of these.
 OUTER = {"course", "drive", "notebook", "scenes", "cli"}
 # The rings between which imports are allowed, beside those to the core.
-ALLOWED = {
-    ("cli", "course"),
-    ("cli", "drive"),
-    ("cli", "notebook"),
-    ("cli", "scenes"),
-}
+ALLOWED = {("cli", ring) for ring in ("course", "drive", "notebook", "scenes")}
 
 HEAVY = {"matplotlib", "moviepy", "sklearn", "pandas", "pooch", "jinja2", "dask", "pyarrow", "motmetrics"}
 HEAVY |= {"ipywidgets", "IPython"}

@@ -284,10 +284,7 @@ def test_the_three_scales_have_11580_windows():
     ("arguments", "message"),
     [
         ({"image": IMAGE[:40, :40]}, "image of 40x40 pixels holds no search window .*; pass a larger image"),
-        (
-            {"classifier": to_pipeline(random_classifier(SMALL))},
-            "classifier must be a VehicleClassifier, .*one",
-        ),
+        ({"classifier": to_pipeline(random_classifier(SMALL))}, "classifier must be a VehicleClassifier"),
     ],
 )
 def test_find_cars_rejects_invalid_arguments(arguments, message):

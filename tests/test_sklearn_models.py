@@ -130,10 +130,7 @@ def test_pipelines_that_cannot_be_converted(patches, labels):
         (fit(scaler, Squared()), "weighted sum of the features; StandardScaler and Squared"),
         (fit(scaler, LinearSVC(C=1e-5), labels=many), "0 or -1 for others and 1 for vehicles; got .*2"),
         (fit(scaler, LinearSVC(), labels=names), "must be fitted on the labels 0 or -1"),
-        (
-            fit(StandardScaler(), LinearSVC(), rows=rows[:, :5]),
-            rf"on the {SMALL.length} features .*; its StandardScaler .* 5",
-        ),
+        (fit(StandardScaler(), LinearSVC(), rows=rows[:, :5]), "features .*; its StandardScaler .* 5"),
     ):
         with pytest.raises(InvalidInputError, match=message):
             VehicleClassifier.from_pipeline(pipeline, SMALL)
@@ -155,9 +152,7 @@ def test_a_model_of_images_with_values_0_to_1_is_rejected(patches, labels, color
         if is_float and scaler is MaxAbsScaler and color_space in ("LUV", "LAB"):
             continue  # it subtracts nothing, so that its scales do not show the range
         if is_float:
-            with pytest.raises(
-                InvalidInputError, match=r"fitted on values 0-1.*read_image to extract_features"
-            ):
+            with pytest.raises(InvalidInputError, match=r"fitted on values 0-1.*read_image"):
                 VehicleClassifier.from_pipeline(model, params)
         else:
             assert VehicleClassifier.from_pipeline(model, params).score(patches, labels) > 0.9

@@ -163,9 +163,7 @@ def test_estimators_that_cannot_be_used(patches, labels):
         training = TrainingOptions(**options)
         train_classifier(patches, labels, params=SMALL, estimator=estimator, options=training)
 
-    with pytest.raises(
-        InvalidInputError, match=r"estimator must be a linear .* such as LinearSVC; got GaussianN"
-    ):
+    with pytest.raises(InvalidInputError, match=r"estimator must be a linear .* such as LinearSVC"):
         train(GaussianNB())
     with pytest.raises(InvalidInputError, match=r"estimator must be a scikit-learn classifier .*type"):
         train(LinearSVC)
@@ -318,10 +316,7 @@ def write_model(path, tensors=None, **changes):
         ({"0.scale": np.zeros(SMALL.length)}, "scale must be positive"),
         ({"0.coef": np.ones(5)}, "coef must be a vector of the features' length"),
         ({"0.intercept": np.zeros(2)}, "cannot reshape"),
-        (
-            {"0.mean": np.zeros(5), "0.scale": np.ones(5), "0.coef": np.ones(5)},
-            f"templates must have {SMALL.length} weights, the length of the features; got 5",
-        ),
+        ({f"0.{name}": np.ones(5) for name in ("mean", "scale", "coef")}, "must have .* weights, .*; got 5"),
         ({"0.mean": None}, "'0.mean'"),
         ({"extra": np.zeros(3)}, "'1.mean'"),
         (dict.fromkeys(("0.mean", "0.scale", "0.coef", "0.intercept")), "at least one template"),

@@ -151,10 +151,7 @@ def test_both_borders_differ_only_in_the_gradients():
         ([[-1, 0, 63, 64]], "in row 0; use slide_window, or clip_boxes"),
         ([[0, 80, 64, 144]], "inside the 200x120 image"),
         ([[10, 10, 10, 20]], "windows must be non-empty boxes"),
-        (
-            [[0, 0, 64, 64], [0, 0, 64.5, 64]],
-            r"windows must be whole pixels; got \[0.0, 0.0, 64.5, 64.0\] in row 1; round them first",
-        ),
+        ([[0, 0, 64, 64], [0, 0, 64.5, 64]], "windows must be whole pixels; .* in row 1; round them first"),
     ],
 )
 def test_search_windows_rejects_invalid_windows(windows, message):

@@ -34,8 +34,8 @@ CLOUDFRONT = "?Expires=1769847300&Signature=ab~12__&Key-Pair-Id=K2J&Policy=eyJ"
         ("http://a:1@b/x, http://c:2@d/y", "http://***@b/x, http://***@d/y"),
         ("http://cam:8080/x failed at 5 @ home", "http://cam:8080/x failed at 5 @ home"),
         (
-            "rtsp://cam/user=anna_password=a_word_channel=1_stream=0.sdp",
-            "rtsp://cam/user=***_password=***_channel=1_stream=0.sdp",
+            "rtsp://cam/user=anna_password=a_word_channel=1.sdp",
+            "rtsp://cam/user=***_password=***_channel=1.sdp",
         ),
         ("s3://fleet/date=2026-01-31/camera=front/a.mp4", "s3://fleet/date=2026-01-31/camera=front/a.mp4"),
     ],

@@ -32,18 +32,8 @@ def test_help_has_a_short_option():
         assert "Show this message and exit" in succeed(*words, "-h")
 
 
-HEAVY = {
-    "numba",
-    "scipy",
-    "sklearn",
-    "skimage",
-    "pandas",
-    "matplotlib",
-    "moviepy",
-    "jinja2",
-    "pooch",
-    "pydantic",
-}
+HEAVY = {"numba", "scipy", "sklearn", "skimage", "pandas", "matplotlib", "moviepy", "jinja2", "pooch"}
+HEAVY |= {"pydantic"}
 
 
 @pytest.mark.parametrize(

@@ -70,12 +70,8 @@ def test_both_archives_are_downloaded_once(server, tmp_path, capsys):
     folder = tmp_path / "new" / "cache"
     paths = fetch_patches(folder, url=server.url, progress=False)
     assert paths == (folder / "vehicles.zip", folder / "non-vehicles.zip")
-    assert load_training_patches(*paths).counts() == {
-        "Extras": 1,
-        "GTI": 1,
-        "GTI_Far": 2,
-        "KITTI_extracted": 1,
-    }
+    counts = {"Extras": 1, "GTI": 1, "GTI_Far": 2, "KITTI_extracted": 1}
+    assert load_training_patches(*paths).counts() == counts
     assert sorted(os.listdir(folder)) == ["non-vehicles.zip", "vehicles.zip"]
     assert server.requests == ["/data/vehicles.zip", "/data/non-vehicles.zip"]
     assert fetch_patches(folder, url=f"{server.url}/", progress=False) == paths

@@ -183,13 +183,6 @@ def test_a_label_does_not_switch_to_and_fro_while_a_vehicle_passes():
     assert 1 <= changes <= 2
 
 
-def contrast(one, other):
-    values = np.array([one, other]) / 255
-    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-    dark, light = sorted(linear @ [0.2126, 0.7152, 0.0722])
-    return (light + 0.05) / (dark + 0.05)
-
-
 @settings(max_examples=40)
 @given(
     st.lists(st.tuples(*[st.integers(-200, 1500)] * 2, *[st.integers(1, 400)] * 2), max_size=6),
@@ -247,6 +240,3 @@ def test_shares_of_cells_are_drawn_by_sign_and_amount():
     assert (none == 90).all()
     outside = draw_cell_shares(image, [-20, -20, 200, 100], np.zeros((3, 3)))
     np.testing.assert_array_equal(outside, image)
-
-
-FOUND = Detections([[600, 400, 700, 490]], [1.25])

@@ -15,15 +15,9 @@ VOID_ELEMENTS = {"meta", "link", "source", "img"}
 
 def track(number, *, distance=20.0, distance_std=2.0, speed=1.5, speed_std=0.5, confidence=1.0, shown=True):
     return SimpleNamespace(
-        id=number,
-        box=(math.nan,) * 4,
-        shown=shown,
-        distance_m=distance,
-        distance_std_m=distance_std,
-        speed_mps=speed,
-        speed_std_mps=speed_std,
-        confidence=confidence,
-    )
+        id=number, box=(math.nan,) * 4, shown=shown, distance_m=distance, distance_std_m=distance_std,
+        speed_mps=speed, speed_std_mps=speed_std, confidence=confidence,
+    )  # fmt: skip
 
 
 FRAMES = [

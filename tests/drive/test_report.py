@@ -78,9 +78,7 @@ def test_an_earlier_page_stays_if_a_new_one_fails(tmp_path, monkeypatch):
     before = write_report(tmp_path, FRAMES)
     report = ReportWriter(tmp_path / "report.html", video=tmp_path / "missing.mp4")
     report.table.append(0, 0.0, [])
-    with pytest.raises(
-        InvalidInputError, match=r"missing.mp4 does not exist; call finish after process_video"
-    ):
+    with pytest.raises(InvalidInputError, match=r"missing.mp4 does not exist; call finish after"):
         report.finish(video_report(1))
     with pytest.raises(InvalidInputError, match="report must be a VideoReport, got None"):
         report.finish(None)

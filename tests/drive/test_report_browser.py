@@ -170,12 +170,8 @@ def test_charts_show_lines_bands_bars_and_labels(browser, tmp_path):
     write_report(tmp_path, frames, detector=own)
     browser.open(tmp_path / "report.html")
     charts = "[...document.querySelectorAll('.plot[data-series]')]"
-    assert browser.run(f"{charts}.map(each => each.dataset.series)") == [
-        "count",
-        "distance",
-        "ground",
-        "speed",
-    ]
+    series = browser.run(f"{charts}.map(each => each.dataset.series)")
+    assert series == ["count", "distance", "ground", "speed"]
     ticks = browser.run(
         f"{charts}.map(each => [...each.closest('.graph').querySelectorAll('.values text')]"
         ".map(text => +text.textContent.replace('\\u2212', '-')))"

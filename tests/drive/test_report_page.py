@@ -181,18 +181,12 @@ class TestPage:
         ]
         data = json.loads(script_data(write_report(tmp_path, frames)))
         assert (data["fps"], data["frames"], data["step"]) == (FPS, 9, 1)
-        assert data["tracks"] == [
-            {
-                "id": 3,
-                "color": 2,
-                "spans": [[0, 4], [6, 9]],
-                "first": 0,
-                "distance": [10.0, 11.0, 12.0, 13.0, None, None, 16.0, 17.0, 18.0],
-                "std": [2.0] * 4 + [None] * 2 + [2.0] * 3,
-                "speed": [-4.5, -4.5, -4.5, -4.5, None, None, -4.5, -4.5, -4.5],
-                "rough": [0] * 9,
-            }
-        ]
+        (found,) = data["tracks"]
+        assert (found["id"], found["color"], found["spans"], found["first"]) == (3, 2, [[0, 4], [6, 9]], 0)
+        assert found["distance"] == [10.0, 11.0, 12.0, 13.0, None, None, 16.0, 17.0, 18.0]
+        assert found["std"] == [2.0] * 4 + [None] * 2 + [2.0] * 3
+        assert found["speed"] == [-4.5] * 4 + [None] * 2 + [-4.5] * 3
+        assert found["rough"] == [0] * 9
 
     def test_large_standard_errors_mark_distances_and_hide_speeds(self, tmp_path):
         stds = ((3.0, 3.5), (4.5, 2.5), (9.0, 1.5))
@@ -305,7 +299,6 @@ def luminance(color):
     return float(linear_rgb(color) @ [0.2126, 0.7152, 0.0722])
 
 
-# Linear RGB as seen with full color blindness: Machado, Oliveira and Fernandes (2009).
 def contrast(one, other):
     light, dark = sorted((luminance(one), luminance(other)), reverse=True)
     return (light + 0.05) / (dark + 0.05)

@@ -66,10 +66,7 @@ def test_a_box_without_a_vehicle_is_explained_too(detector):
     [
         (np.pad(np.ones((2, 2)), 2), "the center speaks for it"),
         (np.pad(-np.ones((2, 2)), ((4, 0), (0, 4))), "the lower left speaks against it"),
-        (
-            np.pad([[2.0, -1.0]], ((2, 0), (0, 1))),
-            "the lower left speaks for it; the lower middle speaks against it",
-        ),
+        (np.pad([[2.0, -1.0]], ((2, 0), (0, 1))), "the lower middle speaks against it"),
         (np.zeros((6, 6)), "no part stands out"),
     ],
 )

@@ -317,11 +317,7 @@ def test_an_archive_of_cvat(tmp_path):
     ("text", "names", "message"),
     [
         (None, "car", "is not an archive of CVAT: it lacks gt/gt.txt; export MOT 1.1"),
-        (
-            "1,3,10,20,30,40,1,2,1.0",
-            "car",
-            "line 1: class must be a whole number from 1 to 1, as in .* got 2",
-        ),
+        ("1,3,10,20,30,40,1,2,1.0", "car", "line 1: class must be a whole number from 1 to 1, .* got 2"),
         ("1,3,10,20,30,40,1,1.5,1.0", "car", "class must be a whole number from 1 to 1, .* got 1.5"),
         ("1,3", "car", "line 1: expected frame, id"),
     ],

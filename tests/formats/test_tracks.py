@@ -162,19 +162,10 @@ def test_coco_is_a_data_set(tmp_path):
     ]
     first, second, third = data["annotations"]
     assert first == {
-        "id": 1,
-        "image_id": 1,
-        "category_id": 2,
-        "bbox": [10.0, 20.0, 40.25, 40.5],
-        "area": 1630.12,
-        "iscrowd": 0,
-        "score": 1.5,
-        "track_id": 1,
-        "distance_m": 31.25,
-        "speed_mps": -0.5,
-        "confidence": 0.9,
+        "id": 1, "image_id": 1, "category_id": 2, "bbox": [10.0, 20.0, 40.25, 40.5], "area": 1630.12,
+        "iscrowd": 0, "score": 1.5, "track_id": 1, "distance_m": 31.25, "speed_mps": -0.5, "confidence": 0.9,
         "distance_std_m": 2.5,
-    }
+    }  # fmt: skip
     assert "distance_m" not in second
     # The ids of the images do not depend on which frames have rows.
     write_tracks(RESULTS[2:], tmp_path / "t.json")

@@ -4,7 +4,7 @@ import math
 import motmetrics
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
@@ -207,9 +207,7 @@ def test_results_take_the_categories_of_their_truth(tmp_path):
     write_labels(found, results, format="coco_results", truth=truth)
     assert [entry["category_id"] for entry in json.loads(results.read_text())] == [5, 2]
     assert read_labels(results, truth=truth)["label"].tolist() == ["bus", "car"]
-    with pytest.raises(
-        InvalidInputError, match="those of the boxes, which include 'vehicle', got 'car', 'bus'"
-    ):
+    with pytest.raises(InvalidInputError, match="boxes, which include 'vehicle', got 'car', 'bus'"):
         write_labels(boxes_of((0, 1, CAR, 0.5)), results, format="coco_results", truth=truth)
 
 
@@ -422,13 +420,11 @@ def test_parquet_rows_name_their_place(tmp_path):
         read_labels(tmp_path / "t.parquet")
 
 
-@settings(max_examples=20)
-@given(st.data())
-def test_mixed_frames_are_rejected(tmp_path_factory, data):
-    path = tmp_path_factory.mktemp("mixed") / "t.jsonl"
+@pytest.mark.parametrize("broken", [0, 1])
+def test_mixed_frames_are_rejected(tmp_path, broken):
+    path = tmp_path / "t.jsonl"
     write_labels(boxes_of((0, 1, CAR), (1, 1, CAR)), path)
     lines = path.read_text().splitlines()
-    broken = data.draw(st.sampled_from([0, 1]))
     lines[broken] = lines[broken].replace(f'"frame": {broken}', '"frame": "a"')
     path.write_text("\n".join(lines))
     with pytest.raises(DatasetError, match="frame must be a number in every row, or a name in every row"):

@@ -168,11 +168,8 @@ def test_scores_of_a_dynamic_graph(tmp_path):
     ],
 )
 def test_unknown_outputs(tmp_path, outputs):
-    with pytest.raises(
-        ModelFileError, match=r"outputs that are not known: .*; accepted are .*DETR"
-    ) as raised:
+    with pytest.raises(ModelFileError, match=r"network\.onnx .*outputs that are not known: .*DETR"):
         load(tmp_path, constant_network(outputs))
-    assert "network.onnx" in str(raised.value)
 
 
 @pytest.mark.parametrize("kind", ["columns", "rows", "yolov5", "yolox", "final", "detr"])

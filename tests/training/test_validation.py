@@ -100,14 +100,8 @@ def test_recall_of_vehicles_that_are_hard_to_find():
         [60, 20, 100, 50], [60, 60, 100, 90], [120, 20, 150, 50], [2, 20, 50, 50], [120, 60, 160, 99],
         [10, 60, 50, 90], [0, 0, 30, 10],
     ]  # fmt: skip
-    labels = TrackTable(
-        [0] * 7,
-        range(7),
-        boxes,
-        occluded=[0, 1, 0, 0, 0, 0, 1],
-        truncated=[0, 0, 0, 0, 0, 0.3, 0],
-        ignore=np.arange(7) == 6,
-    )
+    columns = {"occluded": [0, 1, 0, 0, 0, 0, 1], "truncated": [0, 0, 0, 0, 0, 0.3, 0]}
+    labels = TrackTable([0] * 7, range(7), boxes, ignore=np.arange(7) == 6, **columns)
     frames = LabelledFrames("road", [np.zeros((100, 200, 3), np.uint8)], labels)
     found = TrackTable([0] * 3, None, [boxes[0], boxes[3], boxes[2]], score=[1.0, 0.5, -0.5])
     score = score_fold(FoldDetections("road", frames, found), 0.0)

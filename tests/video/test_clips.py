@@ -248,9 +248,7 @@ def test_an_image_transform_counts_the_first_frame_once_and_warns_of_speeds():
     "clip", [None, "drive.mp4", np.zeros((2, 2)), AudioClip(lambda t: 0 * t, duration=1)]
 )
 def test_what_is_no_clip_is_refused(clip):
-    with pytest.raises(
-        InvalidInputError, match=r"clip must be a video clip of moviepy 2, got .*process_video"
-    ):
+    with pytest.raises(InvalidInputError, match=r"clip must be a video clip of moviepy .*process_video"):
         annotate_clip(clip, detector_from(find_red))
     with pytest.raises(InvalidInputError, match="on_result must be a function"):
         annotate_clip(clip_of(1), detector_from(find_red), on_result=5)

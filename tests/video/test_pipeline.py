@@ -117,9 +117,7 @@ def test_a_killed_encoder_is_an_error(clip, tmp_path, monkeypatch):
             os.kill(writers[0]._process._popen.pid, signal.SIGKILL)
             time.sleep(0.05)
 
-    with pytest.raises(
-        VideoError, match=r"out.mp4 cannot be written: another process ended ffmpeg by the signal SIGKILL"
-    ):
+    with pytest.raises(VideoError, match=r"out.mp4 cannot be written: another process .*SIGKILL"):
         process_video(clip, tmp_path / "out.mp4", StubDetector(), on_result=kill)
     assert os.listdir(tmp_path) == []
 
