@@ -15,17 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection import drawing
-from vehicle_detection._common import (
-    UNITS,
-    Checked,
-    check,
-    checked_field,
-    choice,
-    describe,
-    integer,
-    invalid,
-    is_listing,
-)
+from vehicle_detection._common import UNITS, check, describe, fields, invalid, is_listing
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera, truncated_edges
 from vehicle_detection.drawing import Color, Image, Rectangle
@@ -47,7 +37,7 @@ def _check_labels(value: Any, name: str) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DrawParams(Checked):
+class DrawParams(fields.Checked):
     """How tracks are drawn.
 
     Attributes
@@ -71,11 +61,11 @@ class DrawParams(Checked):
     'none'
     """
 
-    labels: Collection[str] = checked_field(("id", "distance", "speed"), _check_labels)
-    line_width: int | None = integer(None, low=1, high=1000)
-    color_by: Literal["id", "distance"] = choice("id", ("id", "distance"))
-    panel: Literal["none", "corner", "side"] = choice("none", ("none", "corner", "side"))
-    units: Literal["metric", "imperial"] = choice("metric", UNITS)
+    labels: Collection[str] = fields.checked_field(("id", "distance", "speed"), _check_labels)
+    line_width: int | None = fields.integer(None, low=1, high=1000)
+    color_by: Literal["id", "distance"] = fields.choice("id", ("id", "distance"))
+    panel: Literal["none", "corner", "side"] = fields.choice("none", ("none", "corner", "side"))
+    units: Literal["metric", "imperial"] = fields.choice("metric", UNITS)
 
 
 Point = tuple[int, int]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import Checked, Floats, check, describe, invalid, number, pluralize
+from vehicle_detection._common import Floats, check, describe, fields, invalid, pluralize
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -451,7 +451,7 @@ def check_score_scale(score: object, threshold: float | None) -> ScoreScale:
 
 
 @dataclass(frozen=True)
-class Platt(Checked):
+class Platt(fields.Checked):
     """The sigmoid ``1 / (1 + exp(a * score + b))`` of a score's probability, as `calibrate_scores` fits it.
 
     `a` is negative where higher scores are vehicles.
@@ -461,8 +461,8 @@ class Platt(Checked):
     (array([0.27, 0.95]), 0.5)
     """
 
-    a: float = number()
-    b: float = number()
+    a: float = fields.number()
+    b: float = fields.number()
 
     def probability(self, scores: ArrayLike) -> Floats:
         """Probability of a vehicle for each score, float64 in [0, 1], of the same shape."""

@@ -23,15 +23,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
-    Checked,
     Floats,
     Limit,
     check,
-    checked_field,
     describe,
-    flag,
+    fields,
     invalid,
-    number,
     parse_yaml,
     read_regular_file,
     suggest_keywords,
@@ -80,7 +77,7 @@ Their focal lengths have an error of 8%; a calibrated camera (`read_camera`) is 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Camera(Checked):
+class Camera(fields.Checked):
     """A forward-looking camera over a flat road, with the uncertainty of its parameters.
 
     Attributes
@@ -126,27 +123,27 @@ class Camera(Checked):
     (1155, 360.0)
     """
 
-    focal_px: float = number(above=0, high=1e6)
-    horizon_px: float = number(low=-1e6, high=1e6)
-    horizon_std_px: float = number(0.0, low=0, high=1e6)
-    height_m: float = number(1.3, above=0, high=1e6)
-    vehicle_width_m: float = number(1.78, above=0, high=1e6)
-    vehicle_width_std_m: float = number(0.2, low=0, high=1e6)
-    mean_width_std_m: float = number(0.14, low=0, high=1e6)
-    vehicle_height_m: float = number(1.5, above=0, high=1e6)
-    overhang_m: float = number(0.85, low=0, high=1e6)
-    overhang_std_m: float = number(0.2, low=0, high=1e6)
-    vehicle_length_m: float = number(4.5, low=0, high=1e6)
-    vehicle_length_std_m: float = number(0.8, low=0, high=1e6)
-    bottom_std_px: float = number(2.5, low=0, high=1e6)
-    pitch_std_px: float = number(3.0, low=0, high=1e6)
-    box_std: float = number(0.04, low=0, high=1e6)
-    focal_std: float = number(_LENS_STD, low=0, high=1e6)
-    height_std_m: float = number(0.1, low=0, high=1e6)
-    fisheye: bool = flag(False)
-    k1: float = number(0.0, low=-1, high=1)
-    k2: float = number(0.0, low=-1, high=1)
-    shape: FrameShape | None = checked_field(None, lambda value, _: check.shape(value))  # noqa: RUF009
+    focal_px: float = fields.number(above=0, high=1e6)
+    horizon_px: float = fields.number(low=-1e6, high=1e6)
+    horizon_std_px: float = fields.number(0.0, low=0, high=1e6)
+    height_m: float = fields.number(1.3, above=0, high=1e6)
+    vehicle_width_m: float = fields.number(1.78, above=0, high=1e6)
+    vehicle_width_std_m: float = fields.number(0.2, low=0, high=1e6)
+    mean_width_std_m: float = fields.number(0.14, low=0, high=1e6)
+    vehicle_height_m: float = fields.number(1.5, above=0, high=1e6)
+    overhang_m: float = fields.number(0.85, low=0, high=1e6)
+    overhang_std_m: float = fields.number(0.2, low=0, high=1e6)
+    vehicle_length_m: float = fields.number(4.5, low=0, high=1e6)
+    vehicle_length_std_m: float = fields.number(0.8, low=0, high=1e6)
+    bottom_std_px: float = fields.number(2.5, low=0, high=1e6)
+    pitch_std_px: float = fields.number(3.0, low=0, high=1e6)
+    box_std: float = fields.number(0.04, low=0, high=1e6)
+    focal_std: float = fields.number(_LENS_STD, low=0, high=1e6)
+    height_std_m: float = fields.number(0.1, low=0, high=1e6)
+    fisheye: bool = fields.flag(False)
+    k1: float = fields.number(0.0, low=-1, high=1)
+    k2: float = fields.number(0.0, low=-1, high=1)
+    shape: FrameShape | None = fields.checked_field(None, lambda value, _: check.shape(value))  # noqa: RUF009
 
     @classmethod
     def for_frame(

@@ -16,15 +16,7 @@ from typing import Any, ClassVar, Protocol, Self, cast, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    Closing,
-    available_cores,
-    check,
-    describe,
-    invalid,
-    pluralize,
-    suggest_keywords,
-)
+from vehicle_detection._common import Closing, available_cores, check, invalid, pluralize, suggest_keywords
 from vehicle_detection.annotator import Annotator
 from vehicle_detection.boxes import Detections, Platt
 from vehicle_detection.camera import Camera, open_camera
@@ -110,7 +102,7 @@ def _check_model(model: Any) -> Model:
     if hasattr(model, "predict") and not isinstance(model, VehicleClassifier):
         argument = "pipeline" if hasattr(model, "steps") else "(classifier, scaler)"
         raise InvalidInputError(
-            f"model must not be an estimator of scikit-learn, got {describe(model)}; convert it with "
+            f"model must not be an estimator of scikit-learn, got {check.describe(model)}; convert it with "
             f"VehicleClassifier.from_pipeline({argument}, params), or use HeatmapDetector"
         )
     if isinstance(model, type) or not hasattr(model, "open_search"):

@@ -18,18 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import _kernels as kernels
-from vehicle_detection._common import (
-    Checked,
-    check,
-    checked_field,
-    choice,
-    describe,
-    flag,
-    integer,
-    number,
-    progress_bar,
-    resolve_jobs,
-)
+from vehicle_detection._common import check, describe, fields, progress_bar, resolve_jobs
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image
 
@@ -51,7 +40,7 @@ def _check_spatial_size(size: Any, name: str) -> int:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FeatureParams(Checked):
+class FeatureParams(fields.Checked):
     """Features of a 64x64 patch: ``[spatial | histogram | HOG | coarse HOG]``, each channel by channel.
 
     Attributes
@@ -88,24 +77,24 @@ class FeatureParams(Checked):
     2352
     """
 
-    color_space: str = choice("YCrCb", COLOR_SPACES)
-    spatial_color_space: str | None = choice(None, (None, *COLOR_SPACES))
-    hist_color_space: str | None = choice(None, (None, *COLOR_SPACES))
-    spatial_feat: bool = flag(True)
-    hist_feat: bool = flag(True)
-    hog_feat: bool = flag(True)
-    spatial_size: int = checked_field(16, _check_spatial_size)
-    spatial_order: Literal["channels", "interleaved"] = choice("channels", SPATIAL_ORDERS)
-    hist_bins: int = integer(32, low=1, high=256)
-    orient: int = integer(9, low=1, high=180)
-    pix_per_cell: int = integer(8, low=2, high=PATCH_SIZE)
-    cell_per_block: int = integer(2, low=1, high=PATCH_SIZE // 2)
-    hog_channel: int | Literal["ALL", "GRAY"] = choice("ALL", HOG_CHANNELS)
-    transform_sqrt: bool = flag(False)
-    hist_sqrt: bool = flag(False)
-    coarse_hog: bool = flag(False)
-    hist_gain: float = number(1.0, low=0.01, high=100)
-    coarse_gain: float = number(1.0, low=0.01, high=100)
+    color_space: str = fields.choice("YCrCb", COLOR_SPACES)
+    spatial_color_space: str | None = fields.choice(None, (None, *COLOR_SPACES))
+    hist_color_space: str | None = fields.choice(None, (None, *COLOR_SPACES))
+    spatial_feat: bool = fields.flag(True)
+    hist_feat: bool = fields.flag(True)
+    hog_feat: bool = fields.flag(True)
+    spatial_size: int = fields.checked_field(16, _check_spatial_size)
+    spatial_order: Literal["channels", "interleaved"] = fields.choice("channels", SPATIAL_ORDERS)
+    hist_bins: int = fields.integer(32, low=1, high=256)
+    orient: int = fields.integer(9, low=1, high=180)
+    pix_per_cell: int = fields.integer(8, low=2, high=PATCH_SIZE)
+    cell_per_block: int = fields.integer(2, low=1, high=PATCH_SIZE // 2)
+    hog_channel: int | Literal["ALL", "GRAY"] = fields.choice("ALL", HOG_CHANNELS)
+    transform_sqrt: bool = fields.flag(False)
+    hist_sqrt: bool = fields.flag(False)
+    coarse_hog: bool = fields.flag(False)
+    hist_gain: float = fields.number(1.0, low=0.01, high=100)
+    coarse_gain: float = fields.number(1.0, low=0.01, high=100)
 
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = {
         "luv-2384": _LUV,

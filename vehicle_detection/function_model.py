@@ -7,13 +7,13 @@ import dataclasses
 import functools
 import threading
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Checked, check, invalid, number
+from vehicle_detection._common import check, fields, invalid
 from vehicle_detection.boxes import (
     Detections,
     Platt,
@@ -34,7 +34,7 @@ DetectorFunction = Callable[[NDArray[np.uint8]], Any]
 
 
 @dataclass(frozen=True, kw_only=True)
-class FunctionParams(Checked):
+class FunctionParams(fields.Checked):
     """Parameters of a detector that is a function: it searches the whole frame by itself.
 
     `min_score` is the minimum score, in log-odds, of the boxes that count as positive windows.
@@ -43,7 +43,7 @@ class FunctionParams(Checked):
     1
     """
 
-    min_score: float = number(0.0)
+    min_score: float = fields.number(0.0)
 
     @classmethod
     def default(cls) -> FunctionParams:
@@ -94,7 +94,9 @@ class FunctionModel:
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        values = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "_lock"}
+        values = {
+            each.name: getattr(self, each.name) for each in dataclasses.fields(self) if each.name != "_lock"
+        }
         return functools.partial(type(self), **values), ()
 
     @property

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import Checked, check, choice, integer, invalid, number
+from vehicle_detection._common import check, fields, invalid
 from vehicle_detection.boxes import Detections, clip_boxes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.search import SearchParams
@@ -44,7 +44,7 @@ _SIMILAR_SIZES_FACTOR = 0.6
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeatParams(Checked):
+class HeatParams(fields.Checked):
     """How windows become boxes by a heat map, as in the course.
 
     Attributes
@@ -65,10 +65,10 @@ class HeatParams(Checked):
     5
     """
 
-    weighting: Literal["score", "count"] = choice("score", ("score", "count"))
-    frames: int = integer(5, low=1, high=1000)
-    threshold: float | None = number(None, low=0, high=1e9)
-    peak_fraction: float = number(0.35, low=0, high=0.99)
+    weighting: Literal["score", "count"] = fields.choice("score", ("score", "count"))
+    frames: int = fields.integer(5, low=1, high=1000)
+    threshold: float | None = fields.number(None, low=0, high=1e9)
+    peak_fraction: float = fields.number(0.35, low=0, high=0.99)
 
     def for_search(self, search: Any) -> HeatParams:
         """Return the same parameters with a threshold for `search`; warn if the given one cannot fit it."""

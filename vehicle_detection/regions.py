@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Checked, Floats, check, number
+from vehicle_detection._common import Floats, check, fields
 from vehicle_detection.boxes import Detections, box_areas, clip_boxes, intersection_matrix, overlap_matrices
 from vehicle_detection.camera import Camera
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegionParams(Checked):
+class RegionParams(fields.Checked):
     """How groups of overlapping windows become boxes; lengths are fractions of a window's side.
 
     Attributes
@@ -53,18 +53,18 @@ class RegionParams(Checked):
     1.5
     """
 
-    min_peak: float = number(0.7, low=0, high=1e9)
-    min_evidence: float = number(1.75, low=0, high=1e9)
-    min_iou: float = number(0.5, low=0, high=1)
-    score_power: float = number(2.0, low=0, high=20)
-    suppression_radius: float = number(0.6, above=0, high=2)
-    face_width: float = number(0.84, above=0, high=2)
-    face_height: float = number(0.79, above=0, high=2)
-    face_offset_y: float = number(-0.04, low=-1, high=1)
-    flank_length_m: float = number(6.0, low=0, high=100)
-    flank_shift: float = number(0.27, above=0, high=2)
-    max_coverage: float = number(0.5, low=0, high=1)
-    flank_peak_ratio: float = number(0.5, low=0, high=1)
+    min_peak: float = fields.number(0.7, low=0, high=1e9)
+    min_evidence: float = fields.number(1.75, low=0, high=1e9)
+    min_iou: float = fields.number(0.5, low=0, high=1)
+    score_power: float = fields.number(2.0, low=0, high=20)
+    suppression_radius: float = fields.number(0.6, above=0, high=2)
+    face_width: float = fields.number(0.84, above=0, high=2)
+    face_height: float = fields.number(0.79, above=0, high=2)
+    face_offset_y: float = fields.number(-0.04, low=-1, high=1)
+    flank_length_m: float = fields.number(6.0, low=0, high=100)
+    flank_shift: float = fields.number(0.27, above=0, high=2)
+    max_coverage: float = fields.number(0.5, low=0, high=1)
+    flank_peak_ratio: float = fields.number(0.5, low=0, high=1)
 
     def with_peak(self, score: float) -> RegionParams:
         """Return parameters for another minimum of the best score, and of the evidence in proportion."""

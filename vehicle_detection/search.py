@@ -31,17 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import _kernels as kernels
-from vehicle_detection._common import (
-    Checked,
-    Closing,
-    ThreadTeam,
-    Workspace,
-    check,
-    checked_field,
-    describe,
-    number,
-    single_threaded_opencv,
-)
+from vehicle_detection._common import Closing, ThreadTeam, Workspace, check, fields, single_threaded_opencv
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE, FeatureParams, convert_color, hog_source
@@ -58,7 +48,7 @@ Pair = tuple[float, float]
 def _pair(*, low: float, high: float) -> Callable[[Any, str], Pair]:
     def pair(value: Any, name: str) -> Pair:
         if not isinstance(value, tuple) or len(value) != 2:
-            raise InvalidInputError(f"{name} must be a pair of numbers, got {describe(value)}")
+            raise InvalidInputError(f"{name} must be a pair of numbers, got {check.describe(value)}")
         for index, each in enumerate(value):
             check.number(each, f"{name}[{index}]", low=low, high=high)
         return value
@@ -68,7 +58,9 @@ def _pair(*, low: float, high: float) -> Callable[[Any, str], Pair]:
 
 def _check_bands(bands: Any, name: str) -> tuple[SearchBand, ...]:
     if not (isinstance(bands, (tuple, list)) and bands and all(isinstance(b, SearchBand) for b in bands)):
-        raise InvalidInputError(f"{name} must be a tuple of SearchBand, at least one; got {describe(bands)}")
+        raise InvalidInputError(
+            f"{name} must be a tuple of SearchBand, at least one; got {check.describe(bands)}"
+        )
     return tuple(bands)
 
 
@@ -85,7 +77,7 @@ class PixelBand:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchBand(Checked):
+class SearchBand(fields.Checked):
     """Windows of one size in a horizontal band, in pixels of a frame whose longer side is 1280.
 
     Attributes
@@ -102,10 +94,10 @@ class SearchBand(Checked):
     (0.0, 1.0)
     """
 
-    window: tuple[float, float] = checked_field(MISSING, _pair(low=8, high=4096))
-    y: tuple[float, float] = checked_field(MISSING, _pair(low=-4096, high=4096))
-    x: tuple[float, float] = checked_field((0.0, 1.0), _pair(low=0, high=1))
-    overlap: tuple[float, float] = checked_field((0.875, 0.875), _pair(low=0, high=0.99))
+    window: tuple[float, float] = fields.checked_field(MISSING, _pair(low=8, high=4096))
+    y: tuple[float, float] = fields.checked_field(MISSING, _pair(low=-4096, high=4096))
+    x: tuple[float, float] = fields.checked_field((0.0, 1.0), _pair(low=0, high=1))
+    overlap: tuple[float, float] = fields.checked_field((0.875, 0.875), _pair(low=0, high=0.99))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -142,7 +134,7 @@ class SearchBand(Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchParams(Checked):
+class SearchParams(fields.Checked):
     """Positions and sizes of the windows that are searched.
 
     Attributes
@@ -165,10 +157,10 @@ class SearchParams(Checked):
     horizon_tolerance: ClassVar[float] = 0.1
     """Maximum error of the horizon that the bands allow, as a fraction of the frame's height."""
 
-    bands: tuple[SearchBand, ...] = checked_field(MISSING, _check_bands)
-    horizon: float = number(0.58, low=0, high=1)
-    min_score: float = number(0.0, low=-1e6, high=1e6)
-    horizontal_padding: float = number(0.0, low=0, high=0.9)
+    bands: tuple[SearchBand, ...] = fields.checked_field(MISSING, _check_bands)
+    horizon: float = fields.number(0.58, low=0, high=1)
+    min_score: float = fields.number(0.0, low=-1e6, high=1e6)
+    horizontal_padding: float = fields.number(0.0, low=0, high=0.9)
 
     @classmethod
     def default(cls) -> SearchParams:

@@ -12,16 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import (
-    Floats,
-    check,
-    describe,
-    invalid,
-    pluralize,
-    read_model,
-    store_number,
-    write_model,
-)
+from vehicle_detection._common import Floats, check, fields, invalid, pluralize, read_model, write_model
 from vehicle_detection.boxes import Platt
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.features import PATCH_SIZE, FeatureParams, extract_features
@@ -68,7 +59,7 @@ class Template:
             object.__setattr__(self, name, column)
         if not (self.scale > 0).all():
             raise InvalidInputError("scale must be positive; a constant feature has scale 1")
-        store_number(self, "intercept")
+        fields.store_number(self, "intercept")
         with np.errstate(over="ignore", invalid="ignore"):
             weights, bias = self.fold()
         if not (np.isfinite(weights).all() and math.isfinite(bias)):
@@ -359,7 +350,7 @@ def _weights(classifier: Any, length: int) -> tuple[NDArray[np.float64], float]:
     """Weights and intercept of a fitted linear classifier of two classes."""
     name = type(classifier).__name__
     if not hasattr(classifier, "predict"):
-        raise InvalidInputError(f"pipeline must end in a linear classifier; got {describe(classifier)}")
+        raise InvalidInputError(f"pipeline must end in a linear classifier; got {check.describe(classifier)}")
     if not hasattr(classifier, "classes_"):
         raise InvalidInputError(f"pipeline must be fitted; its {name} is not: call fit first")
     if not hasattr(classifier, "coef_") or not hasattr(classifier, "decision_function"):

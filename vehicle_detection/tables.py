@@ -12,16 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import (
-    Floats,
-    check,
-    describe,
-    invalid,
-    is_listing,
-    natural_key,
-    pluralize,
-    shorten,
-)
+from vehicle_detection._common import Floats, check, invalid, is_listing, natural_key, pluralize, shorten
 from vehicle_detection.boxes import TABLE_COLUMNS, Detections
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.tracking import TRACK_VALUES, UNKNOWN_LABEL, is_result, shown_tracks
@@ -181,7 +172,9 @@ class TrackTable:
             keys = keys if len({*keys}) == len(paths) else map(str, paths)
             return cls.from_detections(dict(zip(keys, detections)))
         if not isinstance(detections, Mapping):
-            raise InvalidInputError(f"detections must be a list or a dictionary, got {describe(detections)}")
+            raise InvalidInputError(
+                f"detections must be a list or a dictionary, got {check.describe(detections)}"
+            )
         for key, found in detections.items():
             check.instance(found, f"detections[{key!r}]", Detections, "pass Detections(boxes, scores)")
         parts = [Detections.empty(), *detections.values()]
@@ -207,7 +200,7 @@ class TrackTable:
         Frames without a track still count as frames. `write_tracks` writes the same, rounded.
         """
         if isinstance(results, Mapping) or not is_listing(results):
-            raise InvalidInputError(f"results must be a list of FrameResult, got {describe(results)}")
+            raise InvalidInputError(f"results must be a list of FrameResult, got {check.describe(results)}")
         table = cls()
         for result in results:
             if not is_result(result):
@@ -226,7 +219,7 @@ class TrackTable:
             remedy = "; convert it with table.to_pandas()" if hasattr(table, "to_pandas") else ""
             raise InvalidInputError(
                 f"table must be a pandas.DataFrame with the columns frame, {', '.join(CORNERS)}; "
-                f"got {describe(table)}{remedy}"
+                f"got {check.describe(table)}{remedy}"
             )
         names = list(table.columns)
         twice = next((name for name in names if names.count(name) > 1), None)
@@ -402,7 +395,7 @@ class TrackTable:
     def renamed(self, rename: Callable[[Any], FrameKey]) -> TrackTable:
         """Return a copy, without times, in which ``rename(key)`` replaces every frame key."""
         if not callable(rename):
-            raise InvalidInputError(f"rename must be a function of a frame key; got {describe(rename)}")
+            raise InvalidInputError(f"rename must be a function of a frame key; got {check.describe(rename)}")
         frames, keys = ([rename(key) for key in each] for each in (self["frame"].tolist(), self._keys))
         columns = {name: self._columns[name][: self._size] for name in self._columns if name in _COLUMNS}
         return TrackTable(frames, boxes=self.boxes, frame_keys=keys, **columns)
@@ -511,7 +504,7 @@ def _parse_frames(cells: Sequence[Any], places: Sequence[str]) -> list[FrameKey]
             keys.append(int(cell))
         else:
             raise DatasetError(
-                f"{place}: frame must be a whole number from 0 or a name, got {describe(cell)}"
+                f"{place}: frame must be a whole number from 0 or a name, got {check.describe(cell)}"
             )
         if type(keys[-1]) is not type(keys[0]):
             raise DatasetError(f"{place}: frame must be a number in every row, or a name in every row")
@@ -569,7 +562,7 @@ def parse_number(cell: Any, name: str, place: str) -> float:
         value, finite = math.nan, False
     if not finite:
         hint = "; use a decimal point" if re.fullmatch(r"\s*-?\d+,\d+\s*", str(cell)) else ""
-        raise DatasetError(f"{place}: {name} must be a finite number, got {describe(cell)}{hint}")
+        raise DatasetError(f"{place}: {name} must be a finite number, got {check.describe(cell)}{hint}")
     return value
 
 
@@ -585,12 +578,12 @@ def _parse_numbers(name: str, cells: Sequence[Any], places: Sequence[str]) -> ND
         if kind is bool and not _is_missing(cell):
             value = _FLAGS.get(str(cell).strip().lower())
             if value is None:
-                raise DatasetError(f"{place}: {name} must be 0 or 1, got {describe(cell)}")
+                raise DatasetError(f"{place}: {name} must be 0 or 1, got {check.describe(cell)}")
         elif not _is_missing(cell) or name in CORNERS:
             value = parse_number(cell, name, place)
             if kind is int and value != int(value):
-                raise DatasetError(f"{place}: {name} must be a whole number, got {describe(cell)}")
+                raise DatasetError(f"{place}: {name} must be a whole number, got {check.describe(cell)}")
             if not column.low <= value <= column.high or (kind is int and value > _MAX_ID):
-                raise DatasetError(f"{place}: {name} must be {column.expected}, got {describe(cell)}")
+                raise DatasetError(f"{place}: {name} must be {column.expected}, got {check.describe(cell)}")
         values.append(kind(value))
     return np.array(values, {bool: np.bool_, int: np.int64, float: np.float64}[kind])

@@ -9,7 +9,7 @@ import numpy as np
 import pandas
 import pytest
 
-from vehicle_detection._common import check, describe, store_number
+from vehicle_detection._common import check, describe, fields
 from vehicle_detection.boxes import Detections
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
@@ -186,10 +186,10 @@ def test_check_number_accepts_numbers_in_range(value):
 def test_stored_numbers_are_those_of_python():
     values = SimpleNamespace(a=np.float32(0.5), b=Fraction(1, 2), c=1)
     for name in "abc":
-        store_number(values, name, low=0, high=1)
+        fields.store_number(values, name, low=0, high=1)
     assert [repr(value) for value in vars(values).values()] == ["0.5", "0.5", "1"]
     with pytest.raises(InvalidInputError, match="c must be a number, at least 2; got 1"):
-        store_number(values, "c", low=2)
+        fields.store_number(values, "c", low=2)
 
 
 def test_check_bool():

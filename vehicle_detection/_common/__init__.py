@@ -1,17 +1,8 @@
 """Helpers for all packages: argument checks, files, threads, progress bars, model files, augmentation."""
 
-from vehicle_detection._common import check
+from vehicle_detection._common import check, fields
 from vehicle_detection._common.augment import blur_patches, degrade_patches, mirror_patches
 from vehicle_detection._common.check import Floats, describe, invalid, is_listing, shorten
-from vehicle_detection._common.fields import (
-    Checked,
-    checked_field,
-    choice,
-    flag,
-    integer,
-    number,
-    store_number,
-)
 from vehicle_detection._common.files import (
     atomic_write,
     check_suffix,

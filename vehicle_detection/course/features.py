@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection import _kernels as kernels
 from vehicle_detection import features as library
-from vehicle_detection._common import Checked, check, checked_field, choice, describe, integer, is_listing
+from vehicle_detection._common import check, describe, fields, is_listing
 from vehicle_detection.course.versions import (
     CHANNEL_ORDERS,
     READERS,
@@ -428,22 +428,22 @@ def _reader(imread: str | Callable[[str], Image], channel_order: str) -> Callabl
 
 
 @dataclass(frozen=True, kw_only=True)
-class FeatureOptions(Checked):
+class FeatureOptions(fields.Checked):
     """The feature options of a lesson function, checked."""
 
-    color_space: str = choice(MISSING, COLOR_SPACES)
-    spatial_size: tuple[int, int] = checked_field(MISSING, check_size)  # (width, height)
-    hist_bins: int = integer(low=1)
-    orient: int = integer(low=1)
-    pix_per_cell: int = integer(low=1)
-    cell_per_block: int = integer(low=1)
-    hog_channel: int | str = choice(MISSING, (0, 1, 2, "ALL"))
-    spatial_feat: bool = checked_field(MISSING, check_switch)
-    hist_feat: bool = checked_field(MISSING, check_switch)
-    hog_feat: bool = checked_field(MISSING, check_switch)
-    hist_range: tuple[float, float] | None = checked_field(MISSING, check_range)
-    transform_sqrt: bool = checked_field(MISSING, check_switch)
-    spatial_order: Literal["interleaved", "channels"] = choice(MISSING, SPATIAL_ORDERS)
+    color_space: str = fields.choice(MISSING, COLOR_SPACES)
+    spatial_size: tuple[int, int] = fields.checked_field(MISSING, check_size)  # (width, height)
+    hist_bins: int = fields.integer(low=1)
+    orient: int = fields.integer(low=1)
+    pix_per_cell: int = fields.integer(low=1)
+    cell_per_block: int = fields.integer(low=1)
+    hog_channel: int | str = fields.choice(MISSING, (0, 1, 2, "ALL"))
+    spatial_feat: bool = fields.checked_field(MISSING, check_switch)
+    hist_feat: bool = fields.checked_field(MISSING, check_switch)
+    hog_feat: bool = fields.checked_field(MISSING, check_switch)
+    hist_range: tuple[float, float] | None = fields.checked_field(MISSING, check_range)
+    transform_sqrt: bool = fields.checked_field(MISSING, check_switch)
+    spatial_order: Literal["interleaved", "channels"] = fields.choice(MISSING, SPATIAL_ORDERS)
 
     def __post_init__(self) -> None:
         for switch, unused in _UNUSED.items():  # the lesson's code does not read them

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import choice, describe, integer, number
+from vehicle_detection._common import describe, fields
 from vehicle_detection.course.features import (
     FeatureOptions,
     Image,
@@ -268,14 +268,14 @@ def find_car_windows(*args: Any, **options: Any) -> list[Corners]:
 class _SearchOptions(FeatureOptions):
     """The options of `find_cars`, checked."""
 
-    ystart: int | None = integer(None, low=0)
-    ystop: int | None = integer(None, low=0)
-    scale: float = number(above=0, high=1e6)
-    cells_per_step: int = integer(low=1)
-    divide_by: float = number(above=0)
-    resize: str = choice(MISSING, ("after conversion", "before conversion"))
-    formula: str = choice(MISSING, FORMULAS)
-    returns: str = choice(MISSING, RETURNS)
+    ystart: int | None = fields.integer(None, low=0)
+    ystop: int | None = fields.integer(None, low=0)
+    scale: float = fields.number(above=0, high=1e6)
+    cells_per_step: int = fields.integer(low=1)
+    divide_by: float = fields.number(above=0)
+    resize: str = fields.choice(MISSING, ("after conversion", "before conversion"))
+    formula: str = fields.choice(MISSING, FORMULAS)
+    returns: str = fields.choice(MISSING, RETURNS)
 
     def rows(self, height: int) -> tuple[int, int]:
         """Rows of the band, clipped to the image's height."""

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check, describe, pluralize, store_number
+from vehicle_detection._common import check, describe, fields, pluralize
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.matching import match_names
@@ -66,7 +66,7 @@ class LabelledFrames:
                 "use the same names in both"
             )
         if self.horizon is not None:
-            store_number(self, "horizon", low=0, high=1)
+            fields.store_number(self, "horizon", low=0, high=1)
         object.__setattr__(self, "labels", labels.select(keys))
 
     def __repr__(self) -> str:

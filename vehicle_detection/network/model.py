@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Checked, Floats, atomic_write, integer, number, single_threaded_opencv
+from vehicle_detection._common import Floats, atomic_write, fields, single_threaded_opencv
 from vehicle_detection.boxes import Detections, Platt, box_areas, greedy_nms, logit
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.network.runtime import Array, Device, Port, Runtime, Session, open_session
@@ -33,7 +33,7 @@ _MIN_PROBABILITY = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetworkParams(Checked):
+class NetworkParams(fields.Checked):
     """Search parameters of a network, which always searches the whole frame.
 
     Attributes
@@ -51,8 +51,8 @@ class NetworkParams(Checked):
     960
     """
 
-    input_size: int | None = integer(None, low=32, high=8192)
-    min_score: float = number(0.0)
+    input_size: int | None = fields.integer(None, low=32, high=8192)
+    min_score: float = fields.number(0.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -69,7 +69,7 @@ class NetworkParams(Checked):
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class NetworkModel(Checked):
+class NetworkModel(fields.Checked):
     """A network that finds vehicles; `load_model` creates it.
 
     Attributes
@@ -116,10 +116,10 @@ class NetworkModel(Checked):
     input_size: int = INPUT_SIZE
     classes: Mapping[int, str] | None = None
     class_ids: NDArray[np.intp] | None = None
-    slope: float = number(1.0, above=0, high=1e9)
-    offset: float = number(0.0, low=-1e9, high=1e9)
-    threshold: float = number(0.0, low=-1e9, high=1e9)
-    nms_iou: float = number(0.6, low=0, high=1)
+    slope: float = fields.number(1.0, above=0, high=1e9)
+    offset: float = fields.number(0.0, low=-1e9, high=1e9)
+    threshold: float = fields.number(0.0, low=-1e9, high=1e9)
+    nms_iou: float = fields.number(0.6, low=0, high=1)
     margins: Margins = (0.0, 0.0, 0.0)
     device: Device = "cpu"
     runtime: Runtime = "auto"

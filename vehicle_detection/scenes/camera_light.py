@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import Checked, check, checked_field, choice, describe, integer, number
+from vehicle_detection._common import check, describe, fields
 from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
 
@@ -176,16 +176,18 @@ def _check_shape(shape: object, name: str) -> tuple[int, int]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneView(Checked):
+class SceneView(fields.Checked):
     """Options of a scene or drive: camera, light and weather."""
 
-    shape: tuple[int, int] = checked_field((720, 1280), _check_shape)  # height and width (px)
-    horizon: float = number(0.56, low=0.1, high=0.9)  # row as a fraction of the height
-    camera_height_m: float = number(1.3, low=0.5, high=5)
+    shape: tuple[int, int] = fields.checked_field((720, 1280), _check_shape)  # height and width (px)
+    horizon: float = fields.number(0.56, low=0.1, high=0.9)  # row as a fraction of the height
+    camera_height_m: float = fields.number(1.3, low=0.5, high=5)
     focal_px: float | None = None  # None: 0.9 times the longer side
-    light: str = choice("day", LIGHTS)
-    rain: float = number(0.0, low=0, high=1)  # 0 (dry) to 1 (heavy): streaks, haze, less contrast, more noise
-    jpeg_quality: int | None = integer(None, low=1, high=100)
+    light: str = fields.choice("day", LIGHTS)
+    rain: float = fields.number(
+        0.0, low=0, high=1
+    )  # 0 (dry) to 1 (heavy): streaks, haze, less contrast, more noise
+    jpeg_quality: int | None = fields.integer(None, low=1, high=100)
 
     def configure(self, rng: Rng) -> SceneConfig:
         """Return the configuration with an exact camera, and a random sun and seed."""

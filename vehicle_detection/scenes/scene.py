@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Checked, check, choice, number
+from vehicle_detection._common import check, fields
 from vehicle_detection.camera import Camera
 from vehicle_detection.scenes.camera_light import (
     Doubles,
@@ -30,15 +30,19 @@ RandomState = int | np.random.Generator | None
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneVehicle(Checked):
+class SceneVehicle(fields.Checked):
     """A vehicle to place in a scene; `kind` and `color` are random if they are None."""
 
-    distance_m: float = number(low=2, high=1000)  # along the road to the nearer tires
-    lateral_m: float = number(0.0, low=-100, high=100)  # of its middle, to the right; a lane is 3.6 m wide
-    kind: str | None = choice(None, VEHICLE_SHAPES)  # hatchback, estate, sedan, mpv, suv, van or truck
-    color: str | None = choice(None, COLORS)
-    view: str = choice("rear", ("rear", "front"))  # the end that the camera sees
-    speed_mps: float = number(0.0, low=-150, high=150)  # away from the camera; only for the ground truth
+    distance_m: float = fields.number(low=2, high=1000)  # along the road to the nearer tires
+    lateral_m: float = fields.number(
+        0.0, low=-100, high=100
+    )  # of its middle, to the right; a lane is 3.6 m wide
+    kind: str | None = fields.choice(None, VEHICLE_SHAPES)  # hatchback, estate, sedan, mpv, suv, van or truck
+    color: str | None = fields.choice(None, COLORS)
+    view: str = fields.choice("rear", ("rear", "front"))  # the end that the camera sees
+    speed_mps: float = fields.number(
+        0.0, low=-150, high=150
+    )  # away from the camera; only for the ground truth
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Checked, Floats, integer, invalid, number, pluralize
+from vehicle_detection._common import Floats, fields, invalid, pluralize
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 
@@ -29,7 +29,7 @@ TIME_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackParams(Checked):
+class TrackParams(fields.Checked):
     """How detections become tracks; times are in seconds of the video, sizes in fractions of a box's size.
 
     Attributes
@@ -81,27 +81,27 @@ class TrackParams(Checked):
     0.3
     """
 
-    score_time_constant: float = number(0.3, above=0, high=3600)
-    high_threshold: float = number(-0.3, low=-1e6, high=1e6)
-    low_threshold: float = number(-1.5, low=-1e6, high=1e6)
-    confirm_score: float = number(0.2, low=-1e6, high=1e6)
-    confirm_hits: int = integer(3, low=1, high=10_000)
-    confirm_seconds: float = number(0.12, low=0, high=3600)
-    instant_confirm_score: float = number(1.3, low=-1e6, high=1e6)
-    tentative_coast: float = number(0.1, low=0, high=3600)
-    show_coast: float = number(0.3, low=0, high=3600)
-    show_covered: float = number(0.4, low=0, high=3600)
-    max_coast: float = number(1.0, low=0, high=3600)
-    max_hidden: float = number(4.0, low=0, high=3600)
-    backfill: float = number(0.32, low=0, high=3600)
-    max_gap: float = number(1.0, above=0, high=3600)
-    max_distance: float = number(0.7, above=0, high=100)
-    max_iou: float = number(0.3, low=0, high=1)
-    max_coverage: float = number(0.7, low=0, high=1)
-    measurement_noise: float = number(0.07, above=0, high=1)
-    measurement_correlation_time: float = number(0.04, low=0, high=3600)
-    process_noise_position: float = number(0.18, above=0, high=100)
-    process_noise_size: float = number(0.1, above=0, high=100)
+    score_time_constant: float = fields.number(0.3, above=0, high=3600)
+    high_threshold: float = fields.number(-0.3, low=-1e6, high=1e6)
+    low_threshold: float = fields.number(-1.5, low=-1e6, high=1e6)
+    confirm_score: float = fields.number(0.2, low=-1e6, high=1e6)
+    confirm_hits: int = fields.integer(3, low=1, high=10_000)
+    confirm_seconds: float = fields.number(0.12, low=0, high=3600)
+    instant_confirm_score: float = fields.number(1.3, low=-1e6, high=1e6)
+    tentative_coast: float = fields.number(0.1, low=0, high=3600)
+    show_coast: float = fields.number(0.3, low=0, high=3600)
+    show_covered: float = fields.number(0.4, low=0, high=3600)
+    max_coast: float = fields.number(1.0, low=0, high=3600)
+    max_hidden: float = fields.number(4.0, low=0, high=3600)
+    backfill: float = fields.number(0.32, low=0, high=3600)
+    max_gap: float = fields.number(1.0, above=0, high=3600)
+    max_distance: float = fields.number(0.7, above=0, high=100)
+    max_iou: float = fields.number(0.3, low=0, high=1)
+    max_coverage: float = fields.number(0.7, low=0, high=1)
+    measurement_noise: float = fields.number(0.07, above=0, high=1)
+    measurement_correlation_time: float = fields.number(0.04, low=0, high=3600)
+    process_noise_position: float = fields.number(0.18, above=0, high=100)
+    process_noise_size: float = fields.number(0.1, above=0, high=100)
 
     def __post_init__(self) -> None:
         super().__post_init__()

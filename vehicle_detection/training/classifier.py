@@ -11,17 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import vehicle_detection
 from vehicle_detection import _kernels as kernels
-from vehicle_detection._common import (
-    Checked,
-    blur_patches,
-    check,
-    degrade_patches,
-    describe,
-    flag,
-    integer,
-    mirror_patches,
-    number,
-)
+from vehicle_detection._common import blur_patches, check, degrade_patches, describe, fields, mirror_patches
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, extract_features, read_patches
@@ -31,7 +21,7 @@ DEFAULT_C = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingOptions(Checked):
+class TrainingOptions(fields.Checked):
     """Options of the training of a patch classifier.
 
     >>> TrainingOptions(C=0.01, degraded=0.05).copy_weights
@@ -39,16 +29,16 @@ class TrainingOptions(Checked):
     """
 
     #: Inverse regularization strength. Small values generalize better to other sequences.
-    C: float = number(DEFAULT_C, above=0, high=1e12)
+    C: float = fields.number(DEFAULT_C, above=0, high=1e12)
     #: Add the mirror image of each patch, with brightness exponents from ``exp(-gamma)`` to ``exp(gamma)``.
-    mirror: bool = flag(True)
-    gamma: float = number(0.0, low=0, high=2)
+    mirror: bool = fields.flag(True)
+    gamma: float = fields.number(0.0, low=0, high=2)
     #: Weight, in [0, 1], of two more copies of each patch, one blurred, the other also desaturated and
     #: compressed, which help on images of other cameras. 0 omits them.
-    degraded: float = number(0.0, low=0, high=1)
+    degraded: float = fields.number(0.0, low=0, high=1)
     #: Cost of a misclassified vehicle, in those of a misclassified non-vehicle.
-    positive_weight: float = number(1.0, above=0, high=1e6)
-    random_state: int = integer(0, low=0, high=2**32 - 1)
+    positive_weight: float = fields.number(1.0, above=0, high=1e6)
+    random_state: int = fields.integer(0, low=0, high=2**32 - 1)
 
     def __post_init__(self) -> None:
         super().__post_init__()

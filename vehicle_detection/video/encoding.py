@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from vehicle_detection._common import Checked, choice, integer
+from vehicle_detection._common import fields
 from vehicle_detection.video.ffmpeg import exit_reason, run_ffmpeg
 
 _LOGGER = logging.getLogger(__name__)
@@ -25,7 +25,7 @@ _USUAL_CRF = 23  # of x264
 
 
 @dataclass(frozen=True, kw_only=True)
-class Encoding(Checked):
+class Encoding(fields.Checked):
     """How a video is encoded as H.264.
 
     Attributes
@@ -43,9 +43,9 @@ class Encoding(Checked):
     'x264'
     """
 
-    preset: str = choice("veryfast", PRESETS)
-    crf: int | None = integer(None, low=0, high=51)
-    encoder: Literal["x264", "auto", "nvenc", "vaapi", "videotoolbox"] = choice("x264", ENCODERS)
+    preset: str = fields.choice("veryfast", PRESETS)
+    crf: int | None = fields.integer(None, low=0, high=51)
+    encoder: Literal["x264", "auto", "nvenc", "vaapi", "videotoolbox"] = fields.choice("x264", ENCODERS)
 
     def options(self, filters: str) -> list[str]:
         """Return the options of ffmpeg that filter and encode frames, with an encoder that works."""
