@@ -204,7 +204,8 @@ class TrackTable:
         table = cls()
         for result in results:
             if not is_result(result):
-                raise invalid("results", "be FrameResult objects", result, "use read_labels for files")
+                remedy = "use read_labels for files, TrackTable.from_pandas for tables"
+                raise invalid("results", "be FrameResult objects", result, remedy)
             table.append(result)
         return table
 
@@ -280,10 +281,9 @@ class TrackTable:
             for name in LABEL_COLUMNS:
                 self._columns.pop(name, None)
         if size > len(self._columns["boxes"]):
-            for name, column in self._columns.items():
-                grown = np.empty((max(2 * size, 64), *column.shape[1:]), column.dtype)
-                grown[: self._size] = column[: self._size]
-                self._columns[name] = grown
+            count = max(2 * size, 64)
+            grown = {name: np.resize(each, (count, *each.shape[1:])) for name, each in self._columns.items()}
+            self._columns = grown
 
     def __len__(self) -> int:
         return self._size

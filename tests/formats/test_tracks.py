@@ -274,7 +274,7 @@ def test_an_error_in_the_results_leaves_the_earlier_file(tmp_path, name):
     path = tmp_path / name
     path.write_text("an earlier file")
     for later in ([7], ROWS[:1], RESULTS[:1], [SimpleNamespace(index=3, tracks=[5])]):
-        with pytest.raises(InvalidInputError, match=r"(results|tracks) must be|frame must be greater"):
+        with pytest.raises(InvalidInputError, match=r"(results|tracks) must be|frame must be at least"):
             write_tracks([*RESULTS, *later], path)
     assert path.read_text() == "an earlier file"
     assert os.listdir(tmp_path) == [name]
@@ -284,7 +284,7 @@ def test_an_error_in_the_results_leaves_the_earlier_file(tmp_path, name):
     ("results", "options", "message"),
     [
         (RESULTS, {"path": "t.xlsx"}, r"path must end in .csv, .*, got 't.xlsx'; or set the format to 'csv'"),
-        (7, {}, "results must be a list of FrameResult or a TrackTable, got 7"),
+        (7, {}, "results must be a list of FrameResult, got 7"),
         (pd.DataFrame({"frame": [0]}), {}, "TrackTable.from_pandas"),
         (RESULTS, {"path": "yolo", "format": "yolo"}, r"shape must be \(height, width\)"),
         (RESULTS, {"path": "f", "format": "yolo", "shape": (9, 9)}, "path must be a new or empty folder"),

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import functools
 import io
 import json
 import math
 import os
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +23,6 @@ from vehicle_detection._common import (
     check_target,
     describe,
     invalid,
-    is_listing,
     open_parquet,
     spreadsheet_text,
     temporary_folder,
@@ -40,7 +40,7 @@ from vehicle_detection.formats.datasets import (
 from vehicle_detection.formats.read import FOLDER_FORMATS, FORMATS
 from vehicle_detection.formats.rows import FRAME_NUMBER, ClassNumbers, Record, without_suffix
 from vehicle_detection.tables import BOX_COLUMNS, CORNERS, NO_TRACK, TRACK_COLUMNS, FrameKey, TrackTable
-from vehicle_detection.tracking import TRACK_VALUES, UNKNOWN_LABEL, is_result, shown_tracks
+from vehicle_detection.tracking import UNKNOWN_LABEL
 
 TIME_COLUMN = "time_s"
 DIGITS = dict(zip((*TRACK_COLUMNS[2:-1], TIME_COLUMN), (2, 2, 2, 2, 4, 2, 2, 4, 2, 2, 3)))
@@ -64,21 +64,7 @@ def _round(record: Record) -> Record:
 
 def track_records(result: Any) -> list[Record]:
     """Return the rounded rows of the shown tracks of a frame's result."""
-    if not is_result(result):
-        raise InvalidInputError(
-            f"results must be FrameResult objects, got {describe(result)}; "
-            "collect rows in a TrackTable, a pandas table with TrackTable.from_pandas"
-        )
-    records = []
-    for track in shown_tracks(result.tracks):
-        record: Record = {"frame": int(result.index), "track_id": int(track.id)}
-        record |= zip(CORNERS, map(float, track.box))
-        for name in TRACK_VALUES[:-1]:
-            value = getattr(track, name, None)
-            record[name] = None if value is None or math.isnan(value) else float(value)
-        record["label"] = getattr(track, "label", UNKNOWN_LABEL)
-        records.append(_round(record))
-    return records
+    return list(map(_round, _table_records(TrackTable.from_results([result]), TRACK_COLUMNS)))
 
 
 def _table_records(table: TrackTable, columns: Sequence[str]) -> list[Record]:
@@ -128,12 +114,9 @@ def _open_csv(part: Path, target: _Target) -> Iterator[Write]:
 
 
 @contextlib.contextmanager
-def _open_json_lines(part: Path, target: _Target) -> Iterator[Write]:
+def _open_lines(part: Path, line: Callable[[Record], str]) -> Iterator[Write]:
     with part.open("w", encoding="utf-8", newline="") as file:
-        yield lambda _, records: file.writelines(
-            json.dumps({name: record[name] for name in target.columns}, ensure_ascii=False) + "\n"
-            for record in records
-        )
+        yield lambda _, records: file.writelines(map(line, records))
 
 
 @contextlib.contextmanager
@@ -142,6 +125,10 @@ def _open_parquet(part: Path, target: _Target) -> Iterator[Write]:
     types |= {"ignore": "bool", "label": "string"}
     with open_parquet(part, {name: types.get(name, "double") for name in target.columns}) as write:
         yield lambda _, records: write(records)
+
+
+def _json_line(columns: Sequence[str], record: Record) -> str:
+    return json.dumps({name: record[name] for name in columns}, ensure_ascii=False) + "\n"
 
 
 def _mot_line(record: Record, *, first_pixel: int = 1, vehicle_class: int = 3, scores: bool = True) -> str:
@@ -159,12 +146,6 @@ def _mot_line(record: Record, *, first_pixel: int = 1, vehicle_class: int = 3, s
         visible = round((1 - record.get("truncated", 0.0)) * (1 - hidden), 2)
         end = (int(not record.get("ignore", False)), vehicle_class, visible)
     return ",".join(map(str, (record["frame"] + 1, record["track_id"], *box, *end))) + "\n"
-
-
-@contextlib.contextmanager
-def _open_mot(part: Path, target: _Target) -> Iterator[Write]:
-    with part.open("w", encoding="utf-8", newline="") as file:
-        yield lambda _, records: file.writelines(map(_mot_line, records))
 
 
 @contextlib.contextmanager
@@ -252,9 +233,9 @@ def _open_kitti(part: Path, target: _Target) -> Iterator[Write]:
 
 _WRITERS: dict[str, Callable[[Path, _Target], contextlib.AbstractContextManager[Write]]] = {
     "csv": _open_csv,
-    "jsonl": _open_json_lines,
+    "jsonl": lambda part, target: _open_lines(part, functools.partial(_json_line, target.columns)),
     "parquet": _open_parquet,
-    "mot": _open_mot,
+    "mot": lambda part, target: _open_lines(part, _mot_line),
     "mot_zip": _open_mot_zip,
     "coco": lambda part, target: open_coco(part, target.shape, target.truth),
     "coco_results": lambda part, target: open_coco_results(part, target.truth or Truth({}, {})),
@@ -411,12 +392,7 @@ def write_tracks(
     0,1,10.00,20.00,50.13,60.00,1.5000,31.40,,,,,vehicle
     """
     if not isinstance(results, TrackTable):
-        if isinstance(results, Mapping) or not is_listing(results):
-            raise invalid("results", "be a list of FrameResult or a TrackTable", results)
-        with open_tracks(path, format=format, shape=shape, fps=fps) as stream:
-            for result in results:
-                stream(result)
-        return stream.rows
+        results = TrackTable.from_results(results)
     named = any(isinstance(key, str) for key in results.frame_keys)
     kind = _check_format(path, format, _STILL_FORMATS if named else _TRACK_FORMATS)
     unknown = {"distance_m", "distance_std_m"}.difference(results.columns)
