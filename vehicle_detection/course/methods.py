@@ -26,14 +26,6 @@ from vehicle_detection.windows import search_windows as search_library_windows
 _Band = tuple[float, Sequence[int], Sequence[int]]
 FindWindows = Callable[[NDArray[np.uint8]], Any]
 
-# Size, rows and overlap of the four lists of windows of the first system: 130 in a 1280x720 frame.
-_WINDOW_LISTS = (
-    ((96, 96), (395, 530), (0.9, 0.5)),
-    ((110, 145), (380, 590), (0.7, 0.6)),
-    ((155, 165), (370, 590), (0.6, 0.5)),
-    ((170, 200), (400, 700), (0.6, 0.5)),
-)
-_COLUMNS = (650, 1280)
 _FEATURES = {
     "orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "spatial_size": (32, 32), "hist_bins": 32,
     "color_space": "YCrCb", "hog_channel": "ALL",
@@ -104,7 +96,7 @@ def window_search(
     return search_list
 
 
-def _scale(pair: Sequence[int], image: NDArray[np.uint8]) -> tuple[int, int]:
+def _scale(pair: Sequence[float], image: NDArray[np.uint8]) -> tuple[int, int]:
     """Positions in an image of those in a 1280x720 frame."""
     factor = max(image.shape) / REFERENCE_WIDTH
     return round(pair[0] * factor), round(pair[1] * factor)
@@ -112,12 +104,13 @@ def _scale(pair: Sequence[int], image: NDArray[np.uint8]) -> tuple[int, int]:
 
 def _list_windows(image: NDArray[np.uint8]) -> NDArray[np.int64]:
     """``(N, 4)`` windows of the four lists, in the right half; the border of the image cuts some off."""
-    windows = [
-        slide_window(
-            image, _scale(_COLUMNS, image), _scale(rows, image), _scale(size, image), overlap, formula="old"
-        )
-        for size, rows, overlap in _WINDOW_LISTS
-    ]
+    params = SearchParams.preset("130-windows")
+    windows = []
+    for band in params.bands:
+        rows = [720 * params.horizon + side for side in band.y]
+        columns = [REFERENCE_WIDTH * side for side in band.x]
+        placed = (_scale(pair, image) for pair in (columns, rows, band.window))
+        windows.append(slide_window(image, *placed, band.overlap, formula="old"))
     height, width = image.shape[:2]
     return np.minimum(np.concatenate(windows).reshape(-1, 4), (width, height, width, height))
 

@@ -196,89 +196,75 @@ def detect_versions(lesson: Any) -> dict[str, Any]:
     >>> versions["imread"], versions["formula"], versions["find_cars_returns"]
     ('mpimg', 'old', 'picture')
     """
+    from vehicle_detection.course import reference
+
     found: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
-        for name, call, versions, expected in _probes(Path(folder, "probe.png"), found):
+        for name, (arguments, options, versions) in _probes(Path(folder, "probe.png")).items():
             function = getattr(lesson, name, None)
             if not callable(function):
                 continue
             try:
                 with _hog_of_2017(function):
-                    returned = call(function)
+                    returned, kind = _call(name, function, arguments, options)
             except Exception as error:
                 problem = f"fails: {type(error).__name__}: {error}"
             else:
-                options = (dict(zip(versions, values)) for values in itertools.product(*versions.values()))
-                matching = (each for each in options if _are_equal(returned, expected(**each)))
-                found.update(version := next(matching, {}))
-                problem = "" if version else "equals no version of the lesson"
+                found |= kind
+                if name in ("extract_features", "find_cars"):
+                    options = {each: found[each] for each in _FEATURE_VERSIONS if each in found}
+                problem = "equals no version of the lesson"
+                for values in itertools.product(*versions.values()):
+                    version = dict(zip(versions, values))
+                    renamed = {_KEYWORDS.get((name, key), key): value for key, value in version.items()}
+                    expected, _ = _call(name, getattr(reference, name), arguments, options | renamed)
+                    if _are_equal(returned, expected):
+                        found |= version
+                        problem = ""
+                        break
             if problem:
                 warn(f"your {name} {problem}; go on using it, and do not import that of the library")
     return found
 
 
-def _probes(file: Path, found: dict[str, Any]) -> Iterator[tuple[str, Any, dict[str, Any], Any]]:
-    """Names of functions, a call of each, its versions, and the results of the reference by version."""
-    from vehicle_detection.course import reference
+# Defaults that change features, and the option of the reference of a default, where it has another name.
+_FEATURE_VERSIONS = ("transform_sqrt", "spatial_order", "hist_range")
+_KEYWORDS = {
+    ("bin_spatial", "spatial_order"): "order",
+    ("color_hist", "hist_range"): "bins_range",
+    ("find_cars", "find_cars_formula"): "formula",
+}
 
+
+def _probes(file: Path) -> dict[str, tuple[Any, dict[str, Any], dict[str, Any]]]:
+    """Arguments and options of a call of each function, and the values of the defaults that it shows."""
     noise = np.random.default_rng(0).integers(60, 180, (25, 30, 3), np.uint8)
     image = np.asarray(cv2.resize(noise, (240, 200), interpolation=cv2.INTER_CUBIC))
     patch = image[:64, :64]
     cv2.imwrite(str(file), patch)
-    sizes = (9, 8, 2)
-    yield (
-        "get_hog_features",
-        lambda function: function(patch[:, :, 1], *sizes, vis=False, feature_vec=True),
-        {"transform_sqrt": (False, True)},
-        lambda **version: reference.get_hog_features(patch[:, :, 1], *sizes, **version),
-    )
-    region = [None, None], [8, None], (64, 64), (0.75, 0.6)
-    yield (
-        "slide_window",
-        lambda function: function(image, *region),
-        {"formula": FORMULAS},
-        lambda formula: reference.slide_window(image, *region, formula=formula),
-    )
-    yield (
-        "bin_spatial",
-        lambda function: function(patch, size=(16, 16)),
-        {"spatial_order": SPATIAL_ORDERS},
-        lambda spatial_order: reference.bin_spatial(patch, (16, 16), order=spatial_order),
-    )
-    yield (
-        "color_hist",
-        lambda function: function(patch, nbins=16),
-        {"hist_range": ((0, 256), None, (0, 1))},
-        lambda hist_range: reference.color_hist(patch, 16, hist_range),
-    )
-    kinds = {name: found[name] for name in ("transform_sqrt", "spatial_order", "hist_range") if name in found}
-    arguments: Any = [str(file)], "YCrCb", (16, 16), 16, *sizes, "ALL"
-    yield (
-        "extract_features",
-        lambda function: function(*arguments),
-        {"imread": READERS, "channel_order": CHANNEL_ORDERS},
-        functools.partial(reference.extract_features, *arguments, **kinds),
-    )
+    channel, region = patch[:, :, 1], ([None, None], [8, None], (64, 64), (0.75, 0.6))
+    whole = {"vis": False, "feature_vec": True}
+    bands = {"divide_by": (255, 1), "cells_per_step": (2, 1, 3), "find_cars_formula": FORMULAS}
+    files = {"imread": READERS, "channel_order": CHANNEL_ORDERS}
+    return {
+        "get_hog_features": ((channel, 9, 8, 2), whole, {"transform_sqrt": (False, True)}),
+        "slide_window": ((image, *region), {}, {"formula": FORMULAS}),
+        "bin_spatial": ((patch,), {"size": (16, 16)}, {"spatial_order": SPATIAL_ORDERS}),
+        "color_hist": ((patch,), {"nbins": 16}, {"hist_range": ((0, 256), None, (0, 1))}),
+        "extract_features": (([str(file)], "YCrCb", (16, 16), 16, 9, 8, 2, "ALL"), {}, files),
+        "find_cars": ((image, 16, 200, 1.5, 9, 8, 2, (16, 16), 16), {}, bands),
+    }
 
-    def call_find_cars(function: Any) -> Any:
-        recorder = _Recorder()
-        returned = function(image, 16, 200, 1.5, recorder, recorder, *sizes, (16, 16), 16)
-        parts = [isinstance(part, np.ndarray) for part in returned] if isinstance(returned, tuple) else []
-        found["find_cars_returns"] = (
-            "picture" if isinstance(returned, np.ndarray) else "both" if any(parts) else "boxes"
-        )
-        return recorder.rows
 
-    def expected_rows(find_cars_formula: str, **version: Any) -> Any:
-        recorder = _Recorder()
-        reference.find_cars(
-            image, 16, 200, 1.5, recorder, recorder, *sizes, (16, 16), 16, formula=find_cars_formula,
-            **version, **kinds,
-        )  # fmt: skip
-        return recorder.rows
-
-    choices = {"divide_by": (255, 1), "cells_per_step": (2, 1, 3), "find_cars_formula": FORMULAS}
-    yield "find_cars", call_find_cars, choices, expected_rows
+def _call(name: str, function: Any, arguments: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+    """Return the result of a function; of `find_cars`, the features of all windows and what it returns."""
+    if name != "find_cars":
+        return function(*arguments, **options), {}
+    recorder = _Recorder()
+    returned = function(*arguments[:4], recorder, recorder, *arguments[4:], **options)
+    parts = [isinstance(part, np.ndarray) for part in returned] if isinstance(returned, tuple) else []
+    kind = "picture" if isinstance(returned, np.ndarray) else "both" if any(parts) else "boxes"
+    return recorder.rows, {"find_cars_returns": kind}
 
 
 class _Recorder:
