@@ -213,4 +213,5 @@ class _State:
 
 def _multiplies_bfloat16(device: torch.device) -> bool:
     """Whether the device is faster with bfloat16 than with float32."""
-    return device.type == "cuda" or bool(torch.cpu._is_amx_tile_supported())
+    tests = (getattr(torch.cpu, f"_is_{name}_supported", bool) for name in ("amx_tile", "avx512_bf16"))
+    return device.type == "cuda" or any(test() for test in tests)
