@@ -29,6 +29,7 @@ from vehicle_detection._common import (
     hide_credentials,
     is_url,
     local_path,
+    make_folder,
     open_locked,
     pluralize,
 )
@@ -72,13 +73,7 @@ def open_store(out: object, *, create: bool = False, exists: bool = True) -> Sto
         return Store(text.rstrip("/"))
     folder = Path(os.path.abspath(check.path(text, "out", kind="a folder or a URL")))
     if create:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise InvalidInputError(
-                f"out must be a folder, {folder} cannot be created: {reason}; choose another"
-            ) from error
+        make_folder(folder, "out")
         if not os.access(folder, os.W_OK):
             raise InvalidInputError(
                 f"out {folder} cannot be written; change its permissions, or choose another"

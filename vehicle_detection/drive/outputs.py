@@ -11,13 +11,12 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from itertools import groupby
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
 from vehicle_detection._common import (
     UNITS,
-    Floats,
     Units,
     atomic_write,
     check,
@@ -28,10 +27,9 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.annotator import MAX_SPEED_STD
 from vehicle_detection.drive.events import EVENT_COLUMNS, Event, check_events
-from vehicle_detection.drive.motion import TrackHistory, track_histories
 from vehicle_detection.drive.own_speed import OwnSpeed, own_speeds
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.tables import TrackTable
+from vehicle_detection.tables import NO_TRACK, TrackTable
 from vehicle_detection.video import cut_video, open_source
 
 EVENT_SUFFIXES = (".csv", ".json")
@@ -144,15 +142,6 @@ Format: Layer, Start, End, Style, Name, MarginL, MarginR, MarginV, Effect, Text
 """
 
 
-class _Nearest(NamedTuple):
-    """Medians of a track in one second."""
-
-    id: int
-    distance_m: float
-    distance_std_m: float | None
-    speed_mps: float | None
-
-
 def write_subtitles(
     table: TrackTable,
     path: str | os.PathLike[str],
@@ -226,7 +215,7 @@ def _second_texts(
     """Yield the lines for each second of a video."""
     counts = table.counts()
     seconds = math.ceil(len(counts) / fps - 1e-9)
-    nearest = _nearest_tracks(track_histories(table), fps)
+    nearest = _nearest_tracks(table, fps)
     # In the middle of each second.
     frames = np.minimum((np.arange(seconds) + 0.5) * fps, len(counts) - 1).astype(np.intp)
     own = np.full(seconds, np.nan) if own_speed is None else own_speeds(own_speed, table, fps=fps)[frames]
@@ -247,13 +236,15 @@ def _second_texts(
         yield tuple(lines)
 
 
-def _vehicles(count: int, nearest: _Nearest | None, own_mps: float | None, units: Units) -> str:
-    """Describe the vehicles of a second."""
+def _vehicles(count: int, nearest: Any, own_mps: float | None, units: Units) -> str:
+    """Describe the vehicles of a second; `nearest` is a row of `_nearest_tracks`, if there is one."""
     text = pluralize(count, "vehicle") if count else "no vehicle"
     if nearest is None:
         return text
-    text += f", nearest #{nearest.id}: {units.distance_text(nearest.distance_m, nearest.distance_std_m)}"
-    if nearest.speed_mps is None:
+    text += (
+        f", nearest #{nearest.track_id}: {units.distance_text(nearest.distance_m, nearest.distance_std_m)}"
+    )
+    if math.isnan(nearest.speed_mps):
         return text
     if own_mps is None:
         return f"{text}, {units.speed_text(nearest.speed_mps, None)} relative"
@@ -262,27 +253,18 @@ def _vehicles(count: int, nearest: _Nearest | None, own_mps: float | None, units
     return f"{text}, {units.speed_text(abs(over_ground), None, signed=False)}{oncoming}"
 
 
-def _nearest_tracks(tracks: Iterable[TrackHistory], fps: float) -> dict[int, _Nearest]:
-    """Return the track with the smallest median distance in each second."""
-    found: dict[int, _Nearest] = {}
-    for track in tracks:
-        distances, known = track.columns["distance_m"], np.isfinite(track.columns["distance_m"])
-        precise = track.columns["speed_std_mps"] <= MAX_SPEED_STD
-        seconds = np.floor(track.frames / fps + 1e-9).astype(np.int64)
-        for second in np.unique(seconds[known]).tolist():
-            rows = known & (seconds == second)
-            distance = float(np.median(distances[rows]))
-            if second not in found or distance < found[second].distance_m:
-                std = _median(track.columns["distance_std_m"][rows])
-                speed = _median(track.columns["speed_mps"][rows & precise])
-                found[second] = _Nearest(track.id, distance, std, speed)
-    return found
+def _nearest_tracks(table: TrackTable, fps: float) -> dict[int, Any]:
+    """Medians of the track with the smallest median distance in each second, by the second."""
+    import pandas
 
-
-def _median(values: Floats) -> float | None:
-    """Median of the known values; None if none is known."""
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else None
+    names = ("frame", "track_id", "distance_m", "distance_std_m", "speed_mps")
+    rows = pandas.DataFrame({name: table[name] for name in names})
+    rows["speed_mps"] = rows["speed_mps"].where(table["speed_std_mps"] <= MAX_SPEED_STD)
+    rows["second"] = np.floor(rows["frame"].astype(float) / fps + 1e-9).astype(int)
+    known = rows[(rows["track_id"] != NO_TRACK) & np.isfinite(rows["distance_m"])]
+    medians = known.groupby(["second", "track_id"], as_index=False).median()
+    nearest = medians.sort_values("distance_m", kind="stable").drop_duplicates("second")
+    return {row.second: row for row in nearest.itertuples()}
 
 
 def _merge(texts: Iterable[tuple[str, ...]]) -> Iterator[tuple[int, int, tuple[str, ...]]]:

@@ -16,7 +16,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
@@ -74,13 +74,14 @@ UNKNOWN_CAMERA = "unknown"
 
 @dataclass(frozen=True)
 class _Segment:
-    """What the name of a file contains."""
+    """A file, and what its name contains."""
 
+    file: File
+    name: PurePosixPath  # of a URL without its query
     camera: str
     start: datetime | None
     series: str  # name without time, number and camera; numbers of one series follow each other
     number: int | None
-    end: float | None = None  # modification time, where the name has no time
     chapter: bool = False  # the number counts the parts of one recording
 
 
@@ -128,35 +129,29 @@ def find_trips(files: Iterable[File], *, duration: Callable[[File], float] | Non
     front 2026-01-31 09:30:00 1
     rear 2026-01-31 08:15:00 1
     """
-    groups: defaultdict[tuple[str, str, str, bool], list[tuple[_Segment, File]]] = defaultdict(list)
+    groups: defaultdict[tuple[str, str, str, bool], list[_Segment]] = defaultdict(list)
     for file in check.sequence(files, "files", "paths"):
         if not isinstance(file, (str, Path)):
             raise InvalidInputError(f"files must be paths or URLs, got {describe(file)}; pass strings")
-        name = _posix(file)
-        segment = _parse_name(name)
-        if segment.start is None and isinstance(file, Path):
-            segment = replace(segment, end=_modification_time(file))
+        each = _parse_name(file)
         # Folders named after cameras are told apart by their path already.
-        key = (str(name.parent), segment.camera, segment.series, segment.start is not None)
-        groups[key].append((segment, file))
-    _warn_of_dates([pair for members in groups.values() for pair in members])
+        groups[str(each.name.parent), each.camera, each.series, each.start is not None].append(each)
+    _warn_of_dates([each for members in groups.values() for each in members])
     if duration is None:
-        probed = [file for members in groups.values() if len(members) > 1 for _, file in members]
+        probed = [each.file for members in groups.values() if len(members) > 1 for each in members]
         with ThreadPoolExecutor(available_cores(), thread_name_prefix="vehicle-probe") as pool:
             duration = dict(zip(probed, pool.map(_probe_length, probed), strict=True)).__getitem__
     trips = []
     for key in sorted(groups):
-        members = sorted(
-            groups[key],
-            key=lambda pair: (pair[0].start or datetime.min, pair[0].number or 0, _posix(pair[1]).name),
-        )
+        members = groups[key]
+        members.sort(key=lambda each: (each.start or datetime.min, each.number or 0, each.name.name))
         trips += _split(members, duration)
     return trips
 
 
-def _warn_of_dates(members: Sequence[tuple[_Segment, File]]) -> None:
+def _warn_of_dates(segments: Sequence[_Segment]) -> None:
     """Warn of dates in names that are those of a clock that was not set: in the future, or long ago."""
-    dated = [(segment.start, file) for segment, file in members if segment.start is not None]
+    dated = [(each.start, each.file) for each in segments if each.start is not None]
     latest = datetime.now() + timedelta(days=2)
     last = max((start for start, _ in dated if start < latest), default=latest)
     for start, file in dated:
@@ -207,7 +202,7 @@ def open_trip(source: Source, **options: Any) -> FrameSource:
 
 def _mark_gaps(source: FrameSource) -> None:
     """Begin another scene where the names of two files state that one does not follow the other, and warn."""
-    starts = [_parse_name(_posix(file)).start for file in source.files]
+    starts = [_parse_name(file).start for file in source.files]
     for (begin, end), files, (first, second) in zip(
         *map(itertools.pairwise, (source.segment_starts, source.files, starts))
     ):
@@ -233,7 +228,7 @@ def segment_clock(source: FrameSource) -> tuple[tuple[float, float], ...]:
     in the names.
     """
     check.instance(source, "source", FrameSource, "pass what open_trip returns")
-    starts = [_parse_name(_posix(file)).start for file in source.files]
+    starts = [_parse_name(file).start for file in source.files]
     clock, offset = list[tuple[float, float]](), 0.0
     for begin, start in zip(source.segment_starts, starts):
         if start is None or starts[0] is None:
@@ -245,22 +240,19 @@ def segment_clock(source: FrameSource) -> tuple[tuple[float, float], ...]:
     return tuple(clock)
 
 
-def _posix(file: File) -> PurePosixPath:
-    """Path of a file, or of a URL without its query, which may hold another time."""
+def _parse_name(file: File) -> _Segment:
+    """Read time, number and camera from the name of a file, or of a URL: its query may hold another time."""
     text = os.fspath(file)
     if is_url(text):
-        return PurePosixPath(re.split("[?#]", text)[0] if text.startswith(("http://", "https://")) else text)
-    return PurePosixPath(PurePath(text).as_posix())
-
-
-def _parse_name(name: PurePosixPath) -> _Segment:
-    """Read time, number and camera from the name of a file."""
+        name = PurePosixPath(re.split("[?#]", text)[0] if text.startswith(("http://", "https://")) else text)
+    else:
+        name = PurePosixPath(PurePath(text).as_posix())
     stem = name.stem
     gopro = _GOPRO.match(stem)
     if gopro:  # the chapter comes before the number of the recording
         low = "low " if gopro[1] in ("L", "l") else ""
         series = f"gopro {low}{gopro[3]}"
-        return _Segment(_folder_camera(name), None, series, int(gopro[2] or 0), chapter=True)
+        return _Segment(file, name, _folder_camera(name), None, series, int(gopro[2] or 0), chapter=True)
     start, rest, camera = None, stem, None
     found = _SHORT_TIME.search(stem) or _TIME.search(stem)
     if found:
@@ -277,7 +269,8 @@ def _parse_name(name: PurePosixPath) -> _Segment:
     numbers = [] if start else re.findall(r"\d{4,}", rest)
     number = int(numbers[-1]) if numbers else None
     counter, kept = (r"(?<![A-Za-z0-9])\d{3,}(?![A-Za-z0-9])", "") if start else (r"\d+(?=\D*$)", "#")
-    return _Segment(camera, start, re.sub(counter, kept, rest).strip(" _-.").lower(), number)
+    series = re.sub(counter, kept, rest).strip(" _-.").lower()
+    return _Segment(file, name, camera, start, series, number)
 
 
 def _take_code(text: str) -> tuple[str | None, str]:
@@ -310,20 +303,20 @@ def _folder_camera(name: PurePosixPath) -> str:
     return UNKNOWN_CAMERA
 
 
-def _split(members: Sequence[tuple[_Segment, File]], duration: Callable[[File], float]) -> list[Trip]:
+def _split(segments: Sequence[_Segment], duration: Callable[[File], float]) -> list[Trip]:
     """Split the sorted files of one camera where a segment does not follow the one before."""
-    trips, gaps = [[members[0]]], list[float | None]([None])
+    trips, gaps = [[segments[0]]], list[float | None]([None])
     unclear = None
-    for before, after in itertools.pairwise(members):
+    for before, after in itertools.pairwise(segments):
         gap = _find_gap(before, after, duration)
-        by_number = before[0].number is not None and after[0].number == before[0].number + 1
+        by_number = before.number is not None and after.number == before.number + 1
         follows = gap is not None and abs(gap) <= _TOLERANCE
-        if before[0].start is None:
+        if before.start is None:
             # No camera writes two files at once: earlier times are those of a copy.
             copied = gap is None or gap < -_TOLERANCE
-            follows = by_number and (follows or copied or before[0].chapter)
-            if follows and copied and not before[0].chapter:
-                unclear = unclear or after[1]
+            follows = by_number and (follows or copied or before.chapter)
+            if follows and copied and not before.chapter:
+                unclear = unclear or after.file
         if follows:
             trips[-1].append(after)
         else:
@@ -336,31 +329,30 @@ def _split(members: Sequence[tuple[_Segment, File]], duration: Callable[[File], 
             unclear,
         )
     return [
-        Trip(tuple(file for _, file in trip), trip[0][0].camera, trip[0][0].start, gap)
+        Trip(tuple(each.file for each in trip), trip[0].camera, trip[0].start, gap)
         for trip, gap in zip(trips, gaps, strict=True)
     ]
 
 
-def _find_gap(
-    before: tuple[_Segment, File], after: tuple[_Segment, File], duration: Callable[[File], float]
-) -> float | None:
+def _find_gap(first: _Segment, second: _Segment, duration: Callable[[File], float]) -> float | None:
     """Seconds from the end of a segment to the start of the next one, if known."""
-    (first, first_file), (second, second_file) = before, after
     if first.start is not None and second.start is not None:
-        length = duration(first_file)
+        length = duration(first.file)
         return (second.start - first.start).total_seconds() - length if length > 0 else None
-    if first.chapter or first.end is None or second.end is None:
+    end, next_end = _modification_time(first.file), _modification_time(second.file)
+    if first.chapter or end is None or next_end is None:
         return None
-    step = second.end - first.end
+    step = next_end - end
     if step <= _TOLERANCE:  # copied without their times, or in another order
         return None
-    length = duration(second_file)
+    length = duration(second.file)
     # A last file that cannot be read may have any length.
     return step - length if length > 0 else max(step - _MAX_SEGMENT, 0.0)
 
 
-def _modification_time(file: Path) -> float | None:
+def _modification_time(file: File) -> float | None:
+    """End of a segment, unless its file was copied without its time; None for a URL."""
     try:
-        return file.stat().st_mtime
+        return file.stat().st_mtime if isinstance(file, Path) else None
     except OSError:
         return None

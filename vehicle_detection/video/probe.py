@@ -41,19 +41,8 @@ _FIRST_FRAME = r"n: *0 .*?pts_time:(\S+).*? s:(\d+)x(\d+)"
 _DURATION_IS_END = ("matroska,webm", "flv")
 # Demuxers of streams without a container, besides those whose names end in "_pipe".
 _RAW = {
-    "h264",
-    "hevc",
-    "vvc",
-    "mjpeg",
-    "m4v",
-    "mpegvideo",
-    "h263",
-    "h261",
-    "cavsvideo",
-    "dirac",
-    "vc1",
-    "obu",
-}
+    "h264", "hevc", "vvc", "mjpeg", "m4v", "mpegvideo", "h263", "h261", "cavsvideo", "dirac", "vc1", "obu",
+}  # fmt: skip
 # Rate in Hz above which a rate may be that of a clock, or of frames that arrive in bursts.
 _MAX_RATE = 60
 # Length of the beginning of a remote file whose times are read.
