@@ -381,23 +381,6 @@ def test_find_cars_equals_the_definition(models, dtype, options, scale, name):
     np.testing.assert_array_equal(drawn, reference.draw_boxes(image, expected))
 
 
-def test_the_fast_search_has_the_hits_of_the_lesson(models):
-    svc, scaler = models["all", "uint8"].model
-    scores = []
-    # A replaced method keeps scikit-learn's estimators from the fast search.
-    slow = copy.copy(svc)
-    slow.predict = lambda X: scores.append(svc.decision_function(X)) or scores[-1] > 0
-    arguments = (9, 8, 2, (16, 16), 16)
-    options = {"divide_by": 1, "cells_per_step": 1, "formula": "new"}
-    found, expected = (
-        set(lesson.find_car_windows(FRAMES["uint8"], None, None, 1, clf, scaler, *arguments, **options))
-        for clf in (svc, slow)
-    )
-    uncertain = (np.abs(np.concatenate(scores)) < 1e-3).sum()
-    assert expected
-    assert len(found ^ expected) <= uncertain
-
-
 def old_version(estimator):
     """The estimator as scikit-learn before 0.24 has pickled it."""
     estimator = copy.deepcopy(estimator)
@@ -472,12 +455,14 @@ def test_a_mismatch_of_the_range_of_values_warns(space):
     options = {"color_space": space, "spatial_size": (16, 16), "hist_bins": 16, "hog_channel": "ALL"}
     for images, trained_on, other in ((PATCHES, "0-255", "0-1"), (PATCHES / np.float32(255), "0-1", "uint8")):
         model = trained(np.array(lesson.extract_features(images, **options)))
-        with pytest.warns(UserWarning, match=f"the scaler was fitted on values {trained_on}, .*divide_by=1"):
+        with pytest.warns(UserWarning, match=f"fitted on values {trained_on}, .*divide_by=1") as caught:
             lesson.search_windows(FRAMES[other], PAIRS, *model, **options)
         band = (FRAMES["uint8"], 60, 200, 1, *model, 9, 8, 2, (16, 16), 16)
         divide_by = 255 if trained_on == "0-255" else 1
-        with pytest.warns(UserWarning, match=f"the scaler was fitted on values {trained_on}"):
-            lesson.find_cars(*band, color_space=space, divide_by=divide_by)
+        for find in (lesson.find_cars, lesson.find_car_windows):
+            with pytest.warns(UserWarning, match=f"fitted on values {trained_on}") as also_caught:
+                find(*band, color_space=space, divide_by=divide_by)
+            assert {each.filename for each in (*caught, *also_caught)} == {__file__}
 
 
 UNIT_SPACES = list(UNIT_CHANNELS)
@@ -525,20 +510,6 @@ def test_images_like_those_of_the_training_do_not_warn(color_space, spatial_feat
         options["hist_range"] = hist_range
         model = trained(np.array(lesson.extract_features(images, **options)), clf=DummyClassifier())
         lesson.search_windows(FRAMES[dtype], PAIRS, *model, **options)
-
-
-def test_the_warning_names_the_line_of_the_caller(models):
-    case, image = models["all", "uint8"], FRAMES["0-1"]
-    band = (image, 60, 200, 1, *case.model, 9, 8, 2, (16, 16), 16)
-    for search in (
-        lambda: lesson.search_windows(image, PAIRS, *case.model, **case.options),
-        lambda: lesson.find_car_windows(*band),
-        lambda: lesson.find_cars(*band),
-        lambda: lesson.HeatmapDetector(*case.model, spatial_size=(16, 16), hist_bins=16)(FRAMES["uint8"]),
-    ):
-        with pytest.warns(UserWarning, match="fitted on values 0-255") as caught:
-            search()
-        assert {warning.filename for warning in caught} == {__file__}
 
 
 @given(

@@ -270,22 +270,6 @@ def test_a_cut_ends_the_tracks(regions):
     assert [track.id for track in later.shown] == [2]
 
 
-@pytest.mark.parametrize("regions", ["fitted", "heat"])
-def test_frames_of_another_size_are_another_video(regions):
-    fresh, detector = make(regions=regions), make(regions=regions)
-    for _ in range(10):
-        detector.process(frame_with(CAR))
-    double = frame_with([2 * value for value in CAR], height=2 * HEIGHT, width=2 * WIDTH)
-    assert 1 not in ids_of(detector.process(double))
-    fresh.process(double)
-    for _ in range(9):
-        result, expected = detector.process(double), fresh.process(double)
-    (track,) = result.shown
-    assert track.id == 2
-    assert track.distance_m == pytest.approx(expected.shown[0].distance_m)
-    assert iou_matrix([track.box], [[2 * value for value in CAR]])[0, 0] > 0.5
-
-
 def test_the_search_and_the_camera_have_one_horizon(tmp_path):
     shape, given = (720, 1280), Camera.dashcam(horizon=0.4)
     write_camera(given, tmp_path / "camera.json")

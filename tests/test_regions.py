@@ -256,13 +256,6 @@ def test_find_vehicles_groups_and_fits():
 class TestDefaults:
     """Effects of the default parameters: each test fails if its parameter is disabled."""
 
-    def test_two_windows_form_a_group_and_a_single_one_does_not(self):
-        assert len(group_windows(Detections([window(300)], [1.7]), DEFAULT)) == 0
-        assert len(group_windows(Detections([window(300), window(304)], [0.9, 0.9]), DEFAULT)) == 1
-
-    def test_many_low_scores_form_no_group(self):
-        assert len(group_windows(around((400.0, 430.0), 100, peak=0.65), DEFAULT)) == 0
-
     def test_windows_of_other_sizes_on_a_vehicle_form_no_second_group(self):
         small = around((420.0, 440.0), 64, step=6, peak=1.4)
         large = around((400.0, 430.0), 128, peak=2.5)
@@ -271,8 +264,3 @@ class TestDefaults:
     def test_neighbors_with_overlapping_windows_form_two_groups(self):
         found = around((400.0, 430.0), 100, spread=1) + around((480.0, 430.0), 100, spread=1)
         assert len(group_windows(found, DEFAULT)) == 2
-
-    def test_a_window_on_the_side_of_a_better_one_is_dropped(self):
-        whole, flank = [1000.0, 380, 1160, 540], [960.0, 400, 1050, 490]
-        boxes = fit_boxes(groups_of([whole, flank], [3.0, 1.5]), CAMERA, SHAPE, DEFAULT)
-        assert boxes.scores.tolist() == [3.0]

@@ -60,24 +60,6 @@ def test_the_first_distance_is_that_of_the_better_measurement():
     assert first_range(box, camera=camera)[0] == pytest.approx(8.0)
 
 
-def test_an_uncertain_horizon_gives_more_weight_to_the_width():
-    box = box_at(30.0)
-    fixed, uncertain = (
-        Camera.for_frame(SHAPE, horizon=0.5, horizon_std_px=std, height_std_m=0.0) for std in (0.0, 40.0)
-    )
-    assert first_range(box, camera=fixed)[0] < 26
-    assert first_range(box, camera=uncertain)[0] == pytest.approx(30.0, rel=0.15)
-
-
-def test_inputs_are_not_modified():
-    states = initiate_states(*initiate(BOXES, np.ones((2, 4))), CAMERA)
-    before = [column.copy() for column in states]
-    predict_distances(states, 0.2, CAMERA)
-    update_distances(states, Measurements.from_boxes(BOXES, SHAPE), CAMERA, 0.04, 0.04)
-    for column, copy in zip(states, before, strict=True):
-        np.testing.assert_array_equal(column, copy)
-
-
 def ranges(mean, cov):
     """States of a track with these first values; the others keep their priors."""
     states = initiate_states(*initiate(BOXES[:1], np.ones((1, 4))), CAMERA)

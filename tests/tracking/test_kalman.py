@@ -9,7 +9,6 @@ from vehicle_detection.tracking.distance import initiate_states
 from vehicle_detection.tracking.kalman import (
     UNKNOWN,
     KalmanSmoother,
-    KalmanStates,
     Measurements,
     boxes_from_states,
     centers_and_sizes,
@@ -48,15 +47,6 @@ def test_two_predictions_equal_one_over_the_whole_time():
     twice = predict(*predict(mean, cov, 0.1, density), 0.2, density)
     for one, two in zip(once, twice, strict=True):
         np.testing.assert_allclose(one, two, atol=1e-9)
-
-
-def test_inputs_are_not_modified():
-    mean, cov, density = moving_states()
-    copies = mean.copy(), cov.copy()
-    predict(mean, cov, 0.1, density)
-    corrected(mean, cov, boxes_from_states(mean) + 90.0, density, innovation_mean=np.full((2, 4), 5.0))
-    np.testing.assert_array_equal(mean, copies[0])
-    np.testing.assert_array_equal(cov, copies[1])
 
 
 # --- against the equations of a Kalman filter, one track at a time ---
@@ -166,46 +156,11 @@ def states_of(mean, cov):
     return initiate_states(mean, cov, Camera.for_frame(SHAPE))
 
 
-def test_a_growing_box_accelerates_and_a_coasting_one_slows_down():
-    mean, cov, _ = moving_states()
-    smoother = KalmanSmoother(TrackParams())
-    states = states_of(mean, cov)
-    detected, coasting = (
-        smoother.predict(states, np.full(2, state, np.bool_), 0.1).mean for state in (False, True)
-    )
-    growth = (mean[:, 6:] / mean[:, 2:4]).mean(axis=1, keepdims=True)
-    speed = mean[:, 4:] * np.exp(0.1 * 2 * growth)
-    np.testing.assert_allclose(detected, np.hstack([mean[:, :4] + 0.1 * speed, speed]))
-    speed = mean[:, 4:] * np.exp(-0.1 / np.array([1.5, 1.5, 0.5, 0.5]))
-    np.testing.assert_allclose(coasting, np.hstack([mean[:, :4] + 0.1 * speed, speed]))
-
-
 def test_the_growth_that_counts_as_approach_is_limited():
     mean, cov, _ = moving_states()
     mean[:, 6:] = mean[:, 2:4] * [[5.0], [-5.0]]
     moved = KalmanSmoother(TrackParams()).predict(states_of(mean, cov), np.zeros(2, np.bool_), 0.1).mean
     np.testing.assert_allclose(moved[:, 4:], mean[:, 4:] * np.exp([[0.6], [-0.6]]))
-
-
-@pytest.mark.parametrize("coasting", [False, True])
-def test_the_errors_of_a_prediction_grow_with_the_velocities(coasting):
-    mean, cov, _ = moving_states()
-    cov = cov * 1e-2  # below the limit of the standard errors
-    mean[1, 6:] *= -1
-    params, dt = TrackParams(), 0.1
-    found = KalmanSmoother(params).predict(states_of(mean, cov), np.full(2, coasting), dt)
-    for row in range(2):
-        growth = (mean[row, 6:] / mean[row, 2:4]).mean()
-        rates = -1 / np.array([1.5, 1.5, 0.5, 0.5]) if coasting else np.full(4, 2 * growth)
-        factors = np.hstack([np.ones(4), np.exp(dt * rates)])
-        # A growing box grows faster by the error of its growth, too.
-        factors[6:] *= 1 if coasting else 1 + dt * max(2 * growth, 0)
-        scaled = cov[row] * factors[:, None] * factors
-        sizes = mean[row, [2, 3, 2, 3]]
-        position, size = params.process_noise_position, params.process_noise_size
-        density = (sizes * [position, position, size, size]) ** 2
-        _, expected = predict(mean[row : row + 1], scaled[None], dt, density[None])
-        np.testing.assert_allclose(found.cov[row], expected[0], rtol=1e-9, atol=1e-9)
 
 
 def test_errors_of_coasting_tracks_are_limited():
@@ -294,18 +249,6 @@ def test_the_way_of_a_coasting_track_is_the_integral_of_its_speed():
     expected = np.trapezoid(0.4 * np.exp(times / 1.5), times)
     np.testing.assert_allclose(coasted_distance(mean, np.array([0.6])), [expected], rtol=1e-6)
     assert coasted_distance(mean, np.zeros(1)) == 0
-
-
-def test_rows_of_states_are_taken_put_and_joined():
-    states = states_of(*moving_states()[:2])
-    assert states.take([0, 1]) is states
-    np.testing.assert_array_equal(states.take([1]).mean, states.mean[1:])
-    np.testing.assert_array_equal(states.take([1, 0]).cov, states.cov[::-1])
-    changed = states.put([1], states.take([0]))
-    np.testing.assert_array_equal(changed.mean, states.mean[[0, 0]])
-    assert not np.array_equal(states.mean[0], states.mean[1])
-    joined = KalmanStates.empty().join(states)
-    np.testing.assert_array_equal(joined.range_cov, states.range_cov)
 
 
 def test_exit_times():
