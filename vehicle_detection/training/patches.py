@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import re
 import textwrap
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.resources import files
 from typing import Any, Literal
 
@@ -163,30 +162,34 @@ def train_and_evaluate(
     inner = _inner_split(patch_set, splits["sequences"][0]) if "sequences" in splits else None
     fits = [("final", None), *((name, part) for name, listed in splits.items() for part in listed)]
     fits += [("calibration", inner)] * (inner is not None)
-    seconds: dict[str, float] = {}
-    with ThreadPoolExecutor(resolve_jobs(jobs)) as pool, _timed_steps(progress, len(fits), seconds) as step:
-        with step("features", fits=0):
-            features = patch_features(patch_set.patches, params, options, jobs=jobs)
+    found: dict[str, list[Any]] = {name: [] for name, _ in fits}
+    shown = progress_bar(progress, len(fits), unit="fit", interactive_only=True)
+    with ThreadPoolExecutor(resolve_jobs(jobs)) as pool, shown as bar:
+        features, spent = _timed(lambda: patch_features(patch_set.patches, params, options, jobs=jobs))
+        seconds = defaultdict(float, features=spent)
 
-        def fit(name: str, part: Split | None) -> Any:
+        def fit(part: Split | None) -> Any:
             """Train on all patches; or on a part of them, and return the scores of the others."""
-            with step(name):
-                rows = None if part is None else part.train
-                trained = fit_features(features, labels, params, options, rows=rows)
+            rows = None if part is None else part.train
+            trained = fit_features(features, labels, params, options, rows=rows)
             return trained if part is None else trained.decision_function(features[part.test])
 
-        running = [pool.submit(fit, *each) for each in fits]
+        running = [pool.submit(_timed, partial(fit, part)) for _, part in fits]
         try:
-            with step("leakage", fits=0):
-                leakage = {name: split_leakage(patch_set, listed[0]) for name, listed in splits.items()}
-            classifier, *found = (future.result() for future in running)
+            leakage, seconds["leakage"] = _timed(
+                lambda: {name: split_leakage(patch_set, listed[0]) for name, listed in splits.items()}
+            )
+            for (name, _), future in zip(fits, running):
+                result, spent = future.result()
+                found[name].append(result)
+                seconds[name] += spent
+                bar.update()
         finally:
             pool.shutdown(cancel_futures=True)
-    results = iter(found)
-    tested = {name: list(itertools.islice(results, len(listed))) for name, listed in splits.items()}
-    error = None
+    (classifier,), error = found["final"], None
     if inner is not None:
-        probability = calibrate_scores(found[-1], labels[inner.test]).probability(tested["sequences"][0])
+        platt = calibrate_scores(found["calibration"][0], labels[inner.test])
+        probability = platt.probability(found["sequences"][0])
         error = calibration_error(probability, labels[splits["sequences"][0].test])
     report = TrainingReport(
         params=params,
@@ -197,11 +200,11 @@ def train_and_evaluate(
         non_vehicles=int((labels == 0).sum()),
         fingerprint=patch_set.fingerprint,
         splits={
-            name: _score_split(listed, tested[name], labels, leakage[name]) for name, listed in splits.items()
+            name: _score_split(listed, found[name], labels, leakage[name]) for name, listed in splits.items()
         },
         calibration_error=error,
         skipped=skipped,
-        seconds=seconds,
+        seconds=dict(seconds),
     )
     metadata = {**classifier.metadata, **_report_metadata(report)}
     return dataclasses.replace(classifier, metadata=metadata), report
@@ -282,22 +285,10 @@ def _split_metadata(score: SplitScore) -> dict[str, Any]:
     }
 
 
-@contextmanager
-def _timed_steps(show: bool, total: int, seconds: dict[str, float]) -> Iterator[Callable[..., Any]]:
-    """Show a progress bar of fits; yield a context manager that times a step."""
-    lock = threading.Lock()
-    with progress_bar(show, total, unit="fit", interactive_only=True) as bar:
-
-        @contextmanager
-        def step(name: str, fits: int = 1) -> Iterator[None]:
-            bar.set_description(name)
-            start = time.perf_counter()
-            yield
-            with lock:
-                seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
-                bar.update(fits)
-
-        yield step
+def _timed(function: Callable[[], Any]) -> tuple[Any, float]:
+    """Return the result of a function, and the seconds that it took."""
+    start = time.perf_counter()
+    return function(), time.perf_counter() - start
 
 
 def model_card(
