@@ -212,10 +212,10 @@ def test_the_same_seed_gives_the_same_model(trained, patches, labels, tmp_path):
     ("bad", "message"),
     [
         (np.ones(80), r"labels must hold both classes: vehicles \(1\) and non-vehicles \(0\)"),
-        (np.repeat([1, np.nan], 40), r"labels must be 0 or 1; got \[1.0, nan\]"),
-        (np.repeat([1, -1], 40), r"labels must be 0 or 1; got \[-1, 1\]"),
-        (np.repeat([1, 0], 39), "labels must hold one number for each of 80 patches; got an array of shape"),
-        (np.repeat(["car", "road"], 40), "labels must hold one number for each of 80 patches"),
+        (np.repeat([1, np.nan], 40), "labels must be 0 or 1, or booleans, for each of the 80 patches"),
+        (np.repeat([1, -1], 40), "labels must be .*; convert labels of -1 and 1 with labels > 0"),
+        (np.repeat([1, 0], 39), "labels must be .* for each of the 80 patches, got an array of shape"),
+        (np.repeat(["car", "road"], 40), "labels must be .* for each of the 80 patches"),
         (None, r"labels must be given, unless patches is a PatchSet or a pair \(cars, notcars\)"),
     ],
 )

@@ -57,7 +57,7 @@ def test_selecting_rows(rows):
         (np.zeros((2, 4, 4, 3), np.uint8), [1], ["a", "b"], "labels must hold one entry .* 2 patches, got 1"),
         (np.zeros((2, 4, 4, 3), np.uint8), [1, 1], ["a"], "names must hold one entry .* 2 patches, got 1"),
         (np.zeros((2, 4, 4, 3), np.uint8), [1, -1], ["a", "b"], "labels must be .*labels > 0"),
-        (np.zeros((2, 4, 4, 3), np.uint8), [1.0, 0.5], ["a", "b"], "labels must be one boolean"),
+        (np.zeros((2, 4, 4, 3), np.uint8), [1.0, 0.5], ["a", "b"], "labels must be 0 or 1"),
         (np.zeros((2, 4, 4, 3), np.uint8), [1, 1], ["a", Path("b")], "names must be strings"),
     ],
 )

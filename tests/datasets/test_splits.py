@@ -163,7 +163,7 @@ SEED, EACH, SAME = {"random_state": 0}, set_of([(folder, 1) for folder in FOLDER
         (split_random, [1, 1, 1, 0], SEED, "3 vehicles and 1 non-vehicles are too few .* test part of 20%"),
         (split_random, [], SEED, "0 vehicles and 0 non-vehicles are too few"),
         (split_random, [1, 1, 0, 0], SEED | {"test_size": 1}, r"test_size must be .* \(0, 1\), got 1"),
-        (split_random, [-1, 1, 0, 0], SEED, "patches_or_labels must be one boolean"),
+        (split_random, [-1, 1, 0, 0], SEED, "patches_or_labels must be 0 or 1"),
         (split_sources, EACH, {"train": ("Kitty",)}, r"train must .* \(Extras, GTI, .*got 'Kitty'"),
         (split_sources, EACH, {"train": ("",)}, "train must name sources of patch_set .*got ''"),
         (split_sources, EACH, {"test": ("KITTI",)}, r"test must .* of non-vehicles, got \('KITTI',\)"),

@@ -75,7 +75,7 @@ def test_probabilities_increase_with_the_score(scores, a, b):
 def test_invalid_arguments_of_calibrate_scores():
     for scores, truth, message in (
         ([math.inf, 0], [1, 0], "scores must be finite"),
-        ([0.5, 1.0], [1, -1], "labels of -1 and 1 convert with labels > 0"),
+        ([0.5, 1.0], [1, -1], "convert labels of -1 and 1 with labels > 0"),
         ([0.5, 1.0], [1, 1], "labels must hold both classes"),
     ):
         with pytest.raises(InvalidInputError, match=message):

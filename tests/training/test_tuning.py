@@ -81,7 +81,7 @@ def test_impossible_combinations_are_reported_and_skipped(patch_set, caplog):
         ({"configurations": [{"orientt": 9}]}, "configuration has the unknown option 'orientt'; use color_"),
         ({"splits": "half"}, "splits must be one of 'sequences', 'groups'"),
         ({"splits": ()}, "splits must name at least one of sequences"),
-        ({"splits": {}}, "splits must map names to Split; got"),
+        ({"splits": {}}, "splits must map names to Split; got none"),
         ({"splits": {"mine": Split([0], [120])}}, r"splits\['mine'\] holds row 120, but patch_set has 120"),
         ({"C": ()}, "C must be a number or several; got none"),
         ({"seeds": ()}, "seeds must be a list of different integers, such as range"),

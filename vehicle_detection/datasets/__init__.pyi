@@ -3,11 +3,13 @@ from .archives import is_image as is_image
 from .frames import FrameSet as FrameSet
 from .frames import load_frames as load_frames
 from .patches import PatchSet as PatchSet
+from .patches import check_labels as check_labels
 from .patches import load_patches as load_patches
 from .patches import load_training_patches as load_training_patches
 from .splits import SEEDED_SPLITS as SEEDED_SPLITS
 from .splits import SPLIT_NAMES as SPLIT_NAMES
 from .splits import Split as Split
+from .splits import check_split as check_split
 from .splits import find_near_duplicates as find_near_duplicates
 from .splits import make_split as make_split
 from .splits import make_thumbnails as make_thumbnails

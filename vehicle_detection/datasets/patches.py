@@ -43,7 +43,7 @@ class PatchSet:
         given: object = self.patches
         side = given.shape[1] if isinstance(given, np.ndarray) and given.ndim == 4 else PATCH_SIZE
         patches = check.patches(given, side)
-        labels, names = check_labels(self.labels, "labels"), check.sequence(self.names, "names", "file names")
+        labels, names = check_labels(self.labels), check.sequence(self.names, "names", "file names")
         if not all(isinstance(name, str) for name in names):
             raise InvalidInputError("names must be strings like 'vehicles/GTI_Far/image0000.png'")
         columns: dict[str, Any] = {"patches": patches, "labels": labels, "names": names}
@@ -123,16 +123,27 @@ class PatchSet:
         return hashlib.sha256("\n".join(digests).encode("utf-8", "surrogatepass")).hexdigest()
 
 
-def check_labels(labels: ArrayLike, name: str) -> NDArray[np.bool_]:
-    """Return `labels` as a one-dimensional boolean array."""
+def check_labels(
+    labels: ArrayLike,
+    name: str = "labels",
+    *,
+    count: int | None = None,
+    of: str = "patches",
+    both: bool = False,
+) -> NDArray[np.bool_]:
+    """Return labels, 0 or 1 for each `of` a number of samples, as booleans; `both` classes must occur."""
     array = check.array(labels, name)
     if array.size == 0:
         array = np.empty(0, np.bool_)
-    if array.ndim != 1 or array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
+    numbers = array.ndim == 1 and array.dtype.kind in "biuf" and np.isin(array, (0, 1)).all()
+    if not numbers or count not in (None, len(array)):
+        all_of = of if count is None else f"{count} {of}"
         raise InvalidInputError(
-            f"{name} must be one boolean (or 0 or 1) for each patch, got {describe(array)}; "
+            f"{name} must be 0 or 1, or booleans, for each of the {all_of}, got {describe(array)}; "
             "convert labels of -1 and 1 with labels > 0"
         )
+    if both and len(np.unique(array)) < 2:
+        raise InvalidInputError(f"{name} must hold both classes: vehicles (1) and non-vehicles (0)")
     return array.astype(np.bool_)
 
 

@@ -295,17 +295,21 @@ def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95)
     0.5
     """
     check.instance(patch_set, "patch_set", PatchSet, _PATCH_SET_REMEDY)
-    check.instance(split, "split", Split, "split_sequences and others return one")
+    check_split(split, patch_set)
     limit = check.number(threshold, "threshold", above=0, high=1)
-    last = max(int(rows.max()) for rows in split)
-    if last >= len(patch_set):
-        raise InvalidInputError(
-            f"split holds row {last}, but patch_set has {len(patch_set)} patches; "
-            "pass the set it was made from"
-        )
     thumbnails = make_thumbnails(patch_set)
     _, correlation = find_nearest(thumbnails[split.test], thumbnails[split.train], same=False)
     return float((correlation >= limit * (1 - _ROUNDING)).mean())
+
+
+def check_split(split: Split, patch_set: PatchSet, name: str = "split") -> None:
+    """Raise unless the patches have all rows of the split."""
+    check.instance(split, name, Split, "split_sequences and others return one")
+    last = max(int(rows.max()) for rows in split)
+    if last >= len(patch_set):
+        raise InvalidInputError(
+            f"{name} holds row {last}, but patch_set has {len(patch_set)} patches; pass the set that it is of"
+        )
 
 
 def _check_test_size(test_size: object) -> float:

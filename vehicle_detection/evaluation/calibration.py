@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check, describe
 from vehicle_detection.boxes import Platt as Platt  # its result
+from vehicle_detection.datasets import check_labels
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -37,18 +38,16 @@ def calibrate_scores(
     True
     """
     check.boolean(prior, "prior")
-    values, truth = check.array(scores, "scores"), check.array(labels, "labels")
+    values = check.array(scores, "scores")
     if values.ndim != 1 or not values.size or values.dtype.kind not in "iuf":
         raise InvalidInputError(f"scores must be a one-dimensional array of numbers; got {describe(values)}")
     if not np.isfinite(values).all():
         raise InvalidInputError("scores must be finite, got NaN or infinity; drop those rows")
-    _check_truth(truth, values, "scores")
-    if truth.min() == truth.max():
-        raise InvalidInputError("labels must hold both classes: vehicles (1) and non-vehicles (0)")
+    truth = check_labels(labels, count=len(values), of="scores", both=True).astype(np.int64)
     sample_weight = _check_weights(weights, len(values))
     from sklearn.linear_model import LogisticRegression
 
-    values, truth = values.astype(np.float64), truth.astype(np.int64)
+    values = values.astype(np.float64)
     # The solver needs values of usual size; it does not converge for scores far from 0.
     center, scale = float(values.mean()), float(values.std()) or 1.0
     values = (values - center) / scale
@@ -82,14 +81,6 @@ def _check_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64]
     return np.asarray(values / values.mean(), np.float64)
 
 
-def _check_truth(truth: NDArray[np.generic], values: NDArray[np.generic], name: str) -> None:
-    if truth.shape != values.shape or not np.isin(truth, (0, 1)).all():
-        raise InvalidInputError(
-            f"labels must be 0 or 1 for each of the {len(values)} {name}, got {describe(truth)}; "
-            "labels of -1 and 1 convert with labels > 0"
-        )
-
-
 def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int = 15) -> float:
     """Measure the expected calibration error (ECE): probabilities against the observed fraction of vehicles.
 
@@ -100,14 +91,14 @@ def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int 
     >>> round(calibration_error([0.9, 0.9, 0.1, 0.1], [1, 1, 0, 1]), 3)
     0.25
     """
-    values, truth = check.array(probabilities, "probabilities"), check.array(labels, "labels")
+    values = check.array(probabilities, "probabilities")
     inside = values.dtype.kind in "iuf" and bool(((values >= 0) & (values <= 1)).all())
     if values.ndim != 1 or not values.size or not inside:
         raise InvalidInputError(
             f"probabilities must be a one-dimensional array of numbers from 0 to 1, got {describe(values)}; "
             "convert scores with calibrate_scores(...).probability"
         )
-    _check_truth(truth, values, "probabilities")
+    truth = check_labels(labels, count=len(values), of="probabilities")
     count = check.integer(bins, "bins", low=1, high=10**6)
     values = values.astype(np.float64)
     chosen = np.minimum((values * count).astype(np.intp), count - 1)

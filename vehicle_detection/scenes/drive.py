@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -322,12 +321,13 @@ def write_labels(
     path: str | os.PathLike[str], frames: Iterable[tuple[int | str, Sequence[VehicleTruth]]]
 ) -> None:
     """Write the ground truth of frames, given by number or file name, as CSV, one row per vehicle."""
-    with atomic_write(path, "path") as part, part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(LABEL_COLUMNS)
-        for frame, rows in frames:
-            for row in rows:
-                writer.writerow(
-                    [frame, row.track, *row.box, row.occluded, f"{row.truncated:.3f}", row.ignore,
-                     f"{row.distance_m:.2f}", f"{row.speed_mps:.2f}"]
-                )  # fmt: skip
+    import pandas as pd
+
+    lines = [
+        (frame, row.track, *row.box, row.occluded, f"{row.truncated:.3f}", row.ignore,
+         f"{row.distance_m:.2f}", f"{row.speed_mps:.2f}")
+        for frame, rows in frames
+        for row in rows
+    ]  # fmt: skip
+    with atomic_write(path, "path") as part:
+        pd.DataFrame(lines, columns=LABEL_COLUMNS).to_csv(part, index=False, lineterminator="\n")

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 import vehicle_detection
 from vehicle_detection import _kernels as kernels
 from vehicle_detection._common import blur_patches, check, degrade_patches, describe, fields, mirror_patches
-from vehicle_detection.datasets import PatchSet
+from vehicle_detection.datasets import PatchSet, check_labels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, extract_features, read_patches
 from vehicle_detection.svm import Template, VehicleClassifier, flatten_steps, fold_estimators
@@ -120,7 +120,7 @@ def _read_training_set(patches: Any, labels: ArrayLike | None) -> tuple[NDArray[
         cars, others = (read_patches(part, name) for part, name in zip(patches, ("cars", "notcars")))
         patches, labels = np.concatenate([cars, others]), np.repeat([1, 0], [len(cars), len(others)])
     images = read_patches(patches, "patches")
-    return images, check_labels(labels, len(images))
+    return images, check_labels(labels, count=len(images), both=True).astype(np.int64)
 
 
 def patch_features(
@@ -193,20 +193,6 @@ def check_training(
     check.instance(params, "params", FeatureParams, "omit it for the default")
     check.instance(options, "options", TrainingOptions, "omit it for the default")
     return params, options
-
-
-def check_labels(labels: ArrayLike, count: int) -> NDArray[np.int64]:
-    """Return `labels` as `count` integers 0 or 1, both of which must occur."""
-    array = check.array(labels, "labels")
-    if array.shape != (count,) or array.dtype.kind not in "biuf":
-        raise InvalidInputError(
-            f"labels must hold one number for each of {count} patches; got {describe(array)}"
-        )
-    if not np.isin(array, (0, 1)).all():
-        raise InvalidInputError(f"labels must be 0 or 1; got {np.unique(array)[:5].tolist()}")
-    if count == 0 or array.min() == array.max():
-        raise InvalidInputError("labels must hold both classes: vehicles (1) and non-vehicles (0)")
-    return array.astype(np.int64)
 
 
 def _fit_estimator(

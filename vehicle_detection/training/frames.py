@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check, describe
-from vehicle_detection.datasets import FrameSet, load_frames
+from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, match_names
 from vehicle_detection.formats import read_labels
@@ -129,8 +129,7 @@ def _read_frames(root: Path, file: Path, clip_rate: float) -> LabelledFrames:
                     "are %d images without labels",
                     *(file, len(absent), len(named), folder, absent[0], len(unlabelled)),
                 )
-                kept = tuple(str(key) for key in found.keys if key in named)
-                return LabelledFrames(name, FrameSet(folder, kept), labels)
+                return select_frames(found, named)
             return found
     videos = [path for path in (root / "videos").glob(f"{glob.escape(name)}.*") if is_video_file(path)]
     if videos:

@@ -18,14 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check, pluralize, progress_bar, resolve_jobs
-from vehicle_detection.datasets import PatchSet, Split, make_split, split_leakage, split_sequences
+from vehicle_detection.datasets import (
+    PatchSet,
+    Split,
+    check_labels,
+    make_split,
+    split_leakage,
+    split_sequences,
+)
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import calibrate_scores, calibration_error
 from vehicle_detection.features import FeatureParams
 from vehicle_detection.svm import VehicleClassifier
 from vehicle_detection.training.classifier import (
     TrainingOptions,
-    check_labels,
     check_training,
     fit_features,
     patch_features,
@@ -153,7 +159,7 @@ def train_and_evaluate(
     (['random', 'sequences'], 2, 10)
     """
     check.instance(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
-    labels = check_labels(patch_set.labels, len(patch_set))
+    labels = check_labels(patch_set.labels, both=True).astype(np.int64)
     params, options = check_training(params, options)
     check.choice(split, "split", ("random", "sequences"))
     check.integer(seeds, "seeds", low=1, high=1000)

@@ -23,7 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check, describe, is_listing, progress_bar
-from vehicle_detection.datasets import SEEDED_SPLITS, SPLIT_NAMES, PatchSet, Split, make_split
+from vehicle_detection.datasets import (
+    SEEDED_SPLITS,
+    SPLIT_NAMES,
+    PatchSet,
+    Split,
+    check_labels,
+    check_split,
+    make_split,
+)
 from vehicle_detection.detector import Detector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, best_f1, evaluate_detections, precision_recall_curve
@@ -35,7 +43,6 @@ from vehicle_detection.tables import TrackTable
 from vehicle_detection.training.classifier import (
     DEFAULT_C,
     TrainingOptions,
-    check_labels,
     fit_features,
     train_classifier,
 )
@@ -383,15 +390,10 @@ def _make_splits(
 ) -> Iterator[tuple[str, int, Split]]:
     """Name, seed and rows of each split."""
     if isinstance(splits, Mapping):
-        if not splits or not all(isinstance(split, Split) for split in splits.values()):
-            raise InvalidInputError(f"splits must map names to Split; got {describe(splits)}")
+        if not splits:
+            raise InvalidInputError("splits must map names to Split; got none")
         for name, split in splits.items():
-            last = max(int(split.train.max()), int(split.test.max()))
-            if last >= len(patch_set):
-                raise InvalidInputError(
-                    f"splits[{name!r}] holds row {last}, but patch_set has {len(patch_set)} patches; "
-                    "pass the set it was made from"
-                )
+            check_split(split, patch_set, f"splits[{name!r}]")
             yield str(name), seeds[0], split
         return
     names = (splits,) if isinstance(splits, str) else check.sequence(splits, "splits", "names of splits")
@@ -472,7 +474,7 @@ class Trials:
         """Train on some of the patches; equal to `train_classifier` on them."""
         assert candidate.params is not None
         assert candidate.training is not None
-        check_labels(self._labels[rows], len(rows))
+        check_labels(self._labels[rows], both=True)
         options = dataclasses.replace(candidate.training, random_state=seed)
         return fit_features(self._features(candidate), self._labels, candidate.params, options, rows=rows)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 from collections import Counter
@@ -28,7 +27,7 @@ from vehicle_detection.evaluation import (
     precision_recall_curve,
 )
 from vehicle_detection.tables import FrameKey, TrackTable
-from vehicle_detection.training.frames import FrameDataset
+from vehicle_detection.training.frames import FrameDataset, select_frames
 
 if TYPE_CHECKING:
     from vehicle_detection.search import FrameSearch
@@ -156,10 +155,9 @@ class FoldDetections:
         }
 
     def select(self, keys: Collection[FrameKey], name: str | None = None) -> FoldDetections:
-        """Return the same detections in some of the frames, which are read into memory."""
-        images = {key: image for key, image in self.frames if key in keys}
-        frames = LabelledFrames(name or self.frames.name, images, self.frames.labels)
-        return replace(self, frames=frames, predictions=self.predictions.select(images))
+        """Return the same detections in some of the frames."""
+        frames = replace(select_frames(self.frames, keys), name=name or self.frames.name)
+        return replace(self, frames=frames, predictions=self.predictions.select(frames.keys))
 
 
 def detect_in_source(
@@ -287,10 +285,13 @@ def format_fold(values: Mapping[str, Any], *, missing: str = "") -> list[str]:
 
 def write_curves(path: str | os.PathLike[str], folds: Sequence[FoldDetections]) -> None:
     """Write the precision-recall curve of every fold as CSV, one row for each threshold."""
-    with atomic_write(path, "path") as part, part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["frames", "logit", "precision", "recall"])
-        for fold in folds:
-            for precision, recall, logit in zip(*precision_recall_curve(fold.predictions, fold.labels)):
-                name = spreadsheet_text(fold.frames.name)
-                writer.writerow([name, f"{logit:.4f}", f"{precision:.4f}", f"{recall:.4f}"])
+    import pandas as pd
+
+    rows = [
+        (spreadsheet_text(fold.frames.name), logit, precision, recall)
+        for fold in folds
+        for precision, recall, logit in zip(*precision_recall_curve(fold.predictions, fold.labels))
+    ]
+    table = pd.DataFrame(rows, columns=["frames", "logit", "precision", "recall"])
+    with atomic_write(path, "path") as part:
+        table.to_csv(part, index=False, float_format="%.4f", na_rep="nan", lineterminator="\n")
