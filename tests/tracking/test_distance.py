@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 
+from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
 from vehicle_detection.tracking.distance import (
     estimate_distances,
@@ -11,6 +12,7 @@ from vehicle_detection.tracking.distance import (
     update_distances,
 )
 from vehicle_detection.tracking.kalman import Measurements, initiate
+from vehicle_detection.tracking.tracker import Tracker
 
 SHAPE = (720, 1280)
 CAMERA = Camera.for_frame(SHAPE, horizon_std_px=0.0)
@@ -242,3 +244,14 @@ def test_a_nearer_vehicle_that_hides_the_bottom_edge_leaves_the_distance_unknown
     hidden = [True, False, False, True]
     measured = Measurements.from_boxes(boxes, SHAPE, hidden=hidden)
     assert update_distances(states, measured, CAMERA, 0.1, 0.04).range_cov[0, 0, 0] > 500**2
+
+
+def test_the_distance_does_not_depend_on_the_frame_rate():
+    """The side of the car is visible, and the horizon is unknown and not in the middle."""
+    found, distances = Detections([[890.5, 410, 1000, 472.8]], [5.0]), {}
+    for fps, every in ((10, 1), (25, 2), (30, 2), (50, 4), (60, 5), (120, 10)):
+        tracker = Tracker(fps=fps, camera=Camera.dashcam(fov=58))
+        for frame in range(0, 2 * fps, every):
+            (track,) = tracker.update(found, SHAPE, time=frame / fps)
+        distances[fps] = track.distance_m
+    assert max(distances.values()) < 1.1 * min(distances.values())

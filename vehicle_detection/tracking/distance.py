@@ -43,6 +43,9 @@ _HEIGHT_STD, _HEIGHT_CHANGE = 1.0, 0.1
 # Times (s) in which the width's prior variance is added to its process noise, and over which the error of the
 # horizon (pitch and hills), and other errors that successive frames share, are correlated.
 _WIDTH_TIME, _PITCH_TIME, _SHARED_TIME = 20.0, 1.0, 2.0
+# Most frames that share the errors of a first measurement: those of `_SHARED_TIME` at 10 frames/s. With the
+# multiple of its variance that higher rates give, linearized corrections of the distance would diverge.
+_FIRST_FRAMES = 20.0
 # Error of the rate of a growth (1/s) that successive frames share.
 _GROWTH_BIAS = 0.01
 # Mean innovation of an edge (standard errors) above which a distance is uncertain, and the relative error
@@ -116,7 +119,7 @@ class _View(NamedTuple):
     sees_height: Bools
     is_bound: Bools  # whether the width is only a lower bound
     box_frames: float  # frames that share the error of a box, and other errors
-    shared_frames: float
+    shared_frames: Floats
 
 
 def update_distances(
@@ -182,7 +185,7 @@ def _view(mean: Floats, measured: Measurements, camera: Camera, dt: float, corre
         is_bound=np.asarray(measured.hidden[:, [0, 2]].any(axis=1)),
         # An error that n frames share must not average out among them: its variance is multiplied by n.
         box_frames=max(1.0, correlation_time / dt),
-        shared_frames=max(1.0, _SHARED_TIME / dt),
+        shared_frames=np.full(len(mean), max(1.0, _SHARED_TIME / dt)),
     )
 
 
@@ -210,8 +213,11 @@ def _start(mean: Floats, cov: Floats, view: _View, camera: Camera) -> _View:
     by_width = view.width_scale * np.exp(mean[:, WIDTH]) / view.sides[:, 0]
     first = np.clip(np.where(is_better, by_bottom, by_width), _MIN_DISTANCE, _MAX_DISTANCE)
     mean[known, DISTANCE] = first[known]
-    sees_bottom, sees_height = view.sees_bottom & (is_better | ~unknown), view.sees_height & ~unknown
-    return view._replace(sees_bottom=sees_bottom, sees_height=sees_height)
+    return view._replace(
+        sees_bottom=view.sees_bottom & (is_better | ~unknown),
+        sees_height=view.sees_height & ~unknown,
+        shared_frames=np.where(known, np.minimum(view.shared_frames, _FIRST_FRAMES), view.shared_frames),
+    )
 
 
 def _correct_by_growth(
