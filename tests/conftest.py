@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from vehicle_detection.course.versions import lesson_defaults
 from vehicle_detection.images import decode_image
 
 matplotlib.use("Agg")
@@ -19,6 +20,14 @@ def pytest_collection_finish():
     """Leave what the imports have made, about a million objects, out of garbage collections."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture
+def restored_defaults():
+    """Restore the defaults of the lesson functions after the test."""
+    before = dict(lesson_defaults)
+    yield
+    lesson_defaults.update(before)
 
 
 @pytest.fixture(scope="session")

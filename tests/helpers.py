@@ -202,6 +202,14 @@ def write_frame_set(folder, name, frames, *, place="frames"):
     (folder / "labels" / f"{name}.csv").write_text("\n".join(lines) + "\n")
 
 
+def find_red(image):
+    """A detector of red pixels: the box around all of them, with the probability 0.9."""
+    rows, columns = np.nonzero((image[..., 0] > 180) & (image[..., 1] < 90))
+    if not len(rows):
+        return [], []
+    return [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]], [0.9]
+
+
 SHAPE = (720, 1280)
 
 

@@ -129,17 +129,6 @@ def test_report_writes_json_and_keeps_other_benchmarks(tmp_path):
     assert set(found["machine"]) == {"cores", "processor", "system", "python", "jobs_variable", "libraries"}
 
 
-def test_results_of_another_machine_or_a_damaged_file_are_replaced(tmp_path, monkeypatch):
-    file = tmp_path / "results.json"
-    _report.write_json({"first": [Row("count", 4)]}, file)
-    monkeypatch.setattr(_report, "machine_facts", lambda: {"cores": 128})
-    _report.write_json({"second": [Row("count", 4)]}, file)
-    assert list(json.loads(file.read_text(encoding="utf-8"))["benchmarks"]) == ["second"]
-    file.write_text("{", encoding="utf-8")
-    _report.write_json({"third": [Row("count", 4)]}, file)
-    assert list(json.loads(file.read_text(encoding="utf-8"))["benchmarks"]) == ["third"]
-
-
 def test_a_bound_batch_uses_one_cpu(tmp_path):
     if not _batch.two_cpus():
         pytest.skip("CPUs cannot be bound here, or there is one only")

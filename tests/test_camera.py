@@ -28,11 +28,6 @@ def test_for_frame_places_horizon_and_focal_length():
     assert camera.height_m == 1.5
 
 
-def test_default_focal_length_is_nine_tenths_of_the_longer_side():
-    assert Camera.for_frame(SHAPE).focal_px == pytest.approx(0.9 * 1280, rel=0.01)
-    assert Camera.for_frame((1920, 1080)).focal_px == pytest.approx(0.9 * 1920, rel=0.01)
-
-
 def test_pixel_errors_scale_with_the_focal_length():
     double = Camera.for_frame((1440, 2560), horizon_std_px=8.0)
     assert double.pixel_scale == pytest.approx(2 * CAMERA.pixel_scale)

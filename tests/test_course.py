@@ -23,7 +23,6 @@ import vehicle_detection.course as lesson
 from tests import lesson_reference as reference
 from vehicle_detection import Detections, read_image, write_image
 from vehicle_detection.course import search as search_module
-from vehicle_detection.course.versions import lesson_defaults
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes import render_patches, render_scene
 from vehicle_detection.svm import UNIT_CHANNELS
@@ -230,13 +229,6 @@ def test_cspace_selects_the_features_of_the_earlier_quizzes():
     assert told[0].shape == (3072 + 96 + 1764,)
     with pytest.raises(InvalidInputError, match="same option"):
         lesson.extract_features(PATCHES[:2], cspace="LUV", color_space="LUV")
-
-
-@pytest.fixture
-def restored_defaults():
-    before = dict(lesson_defaults)
-    yield
-    lesson_defaults.update(before)
 
 
 @pytest.mark.usefixtures("restored_defaults")

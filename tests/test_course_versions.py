@@ -25,13 +25,6 @@ pytestmark = [
 ]
 
 
-@pytest.fixture
-def restored_defaults():
-    before = dict(lesson_defaults)
-    yield
-    lesson_defaults.update(before)
-
-
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     folder = tmp_path_factory.mktemp("patches")

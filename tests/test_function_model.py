@@ -10,6 +10,7 @@ import pytest
 from sklearn.pipeline import make_pipeline
 from sklearn.svm import LinearSVC
 
+from tests.helpers import find_red
 from tests.video.clips import write_clip
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import DetectorError, InvalidInputError
@@ -29,14 +30,6 @@ def frame_with(*boxes, shape=SHAPE):
     for x1, y1, x2, y2 in boxes:
         frame[y1:y2, x1:x2] = (240, 15, 15)
     return frame
-
-
-def find_red(image):
-    """The box of all red pixels, with the probability 0.9."""
-    rows, columns = np.nonzero(image[..., 0] > 180)
-    if not len(rows):
-        return [], []
-    return [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]], [0.9]
 
 
 def moved(step):

@@ -1,4 +1,3 @@
-import functools
 import re
 import sys
 
@@ -32,18 +31,10 @@ def initial(tmp_path, monkeypatch):
     """A network that was never trained; trainings of it have small samples."""
     pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
     pytest.importorskip("onnx", reason="export needs onnx, the extra [train]")
-    from tests.training.networks import random_network
-    from vehicle_detection.training import export_network, fine_tune, network
+    from tests.training.networks import shrink_samples, write_initial
 
-    monkeypatch.setattr(fine_tune, "_SIZE", (96, 64))
-    monkeypatch.setattr(fine_tune, "_BATCH", 2)
-    monkeypatch.setattr(fine_tune, "export_network", functools.partial(export_network, quantize=False))
-    monkeypatch.setattr(network, "_CHECKPOINT_SECONDS", 0)
-    monkeypatch.setattr(network, "_REPORT_SECONDS", 0)
-    path = tmp_path / "initial.onnx"
-    params = {"input_size": 160, "slope": 1.0, "offset": 0.0, "threshold": -9.0, "nms_iou": 0.6}
-    path.write_bytes(export_network(random_network(), [], params, {}, quantize=False))
-    return path
+    shrink_samples(monkeypatch)
+    return write_initial(tmp_path / "initial.onnx")
 
 
 def test_train_continue_and_show(roads, initial, tmp_path, monkeypatch):

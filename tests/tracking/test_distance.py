@@ -89,29 +89,6 @@ def test_distances_are_predicted_at_constant_speed():
         assert predict_distances(ranges([start, speed, 0, 0], cov), 0.2, CAMERA).range_mean[0, 0] == end
 
 
-@pytest.mark.parametrize("speed", [-2.0, -20.0])
-@pytest.mark.parametrize("right", [700.0, 560.0])
-def test_the_width_corrects_distance_width_and_length(right, speed):
-    cov = np.array([[9.0, 1.0, 0.2, 0.1], [1.0, 4.0, 0, 0], [0.2, 0, 0.02, 0], [0.1, 0, 0, 0.6]])
-    states = ranges([20.0, speed, 0.05, 0.3], cov)
-    box = np.array([[right - 100.0, 640, right, 720]])  # its bottom edge is truncated
-    found = update_distances(states, Measurements.from_boxes(box, SHAPE), CAMERA, 0.04, 0.04)
-    lateral = max(640 - right, 0)
-    # The boxes of an oncoming vehicle, in another lane, show less of its side.
-    length = CAMERA.vehicle_length_m - (1.0 if speed == -20 else 0.0)
-    scale = CAMERA.focal_px * CAMERA.vehicle_width_m + length * lateral
-    side = lateral / scale
-    # The logarithm of the width in pixels, whose error is that of two edges and of the hidden length.
-    innovation = np.log(100 / scale) - 0.05 - side * 0.3 + np.log(20)
-    jacobian = np.array([-1 / 20, 0, 1, side])
-    edge_std = math.hypot(CAMERA.bottom_std_px * CAMERA.pixel_scale, CAMERA.box_std * 100)
-    variance = 2 * (edge_std / 100) ** 2 + 50 * (side * CAMERA.vehicle_length_std_m) ** 2
-    gain = cov @ jacobian / (jacobian @ cov @ jacobian + variance)
-    np.testing.assert_allclose(found.range_mean[0, :4], [20.0, speed, 0.05, 0.3] + gain * innovation)
-    expected = cov - np.outer(gain, jacobian @ cov)
-    np.testing.assert_allclose(found.range_cov[0, :4, :4], expected, atol=1e-9)
-
-
 def test_the_bottom_edge_of_an_oncoming_vehicle_has_less_weight():
     """A barrier may hide its wheels."""
     box = np.array([[100.0, CAMERA.horizon_px, 200, CAMERA.horizon_px + 40]])

@@ -1,5 +1,3 @@
-import math
-
 import numpy as np
 import pytest
 
@@ -121,26 +119,6 @@ def test_the_variance_of_an_outlier_grows_with_its_square():
         np.testing.assert_allclose(innovation[row], 0.25 * np.clip(errors, -6, 6))
 
 
-def test_an_edge_that_deviates_to_one_side_for_long_is_believed():
-    mean, cov = predicted_states()
-    edges = boxes_from_states(mean) + np.array([[0, 0, 120.0, 0], [0, 0, 0, -90.0]])
-    variance, before = np.full((2, 4), 25.0), np.array([[0, 0, 9.0, 0], [0, 0, 0, 9.0]])
-    after, after_cov, _ = corrected(mean, cov, edges, variance, innovation_mean=before)
-    plain, _, _ = corrected(mean, cov, edges, variance)
-    # The first one deviates to the side of its past. Its edge gains a quarter of the innovation as error of
-    # the position, and five times the innovation per second as error of the velocity.
-    back = np.linalg.inv(EDGES[:, :4])
-    added = back @ np.diag([0, 0, 120.0**2, 0]) @ back.T
-    moved = np.vstack([0.1 * np.eye(4), np.eye(4)])
-    wide = cov[0] + 5**2 * moved @ added @ moved.T
-    wide[:4, :4] += 0.25**2 * added
-    expected, expected_cov = textbook(mean[0], wide, edges[0], variance[0])
-    np.testing.assert_allclose(after[0], expected)
-    np.testing.assert_allclose(after_cov[0], expected_cov, atol=1e-9)
-    # The second one deviates to the other side.
-    np.testing.assert_allclose(after[1], plain[1])
-
-
 def test_only_the_outliers_of_merged_boxes_are_rejected():
     mean, cov = predicted_states()
     shift = np.array([[0, 0, 250.0, 0], [0, 0, 0, 2.0]])
@@ -210,20 +188,6 @@ def test_an_edge_where_a_nearer_vehicle_begins_corrects_little():
     assert 700 - right_edge(boxes - step, hidden) < 0.1 * (700 - right_edge(boxes - step, False))
     # A vehicle that is visible beyond its predicted edge reaches at least as far.
     assert right_edge(boxes + step, hidden) == right_edge(boxes + step, False) > 702
-
-
-def test_correlated_errors_correct_less_at_high_frame_rates():
-    params, boxes = TrackParams(measurement_correlation_time=0.2), BOXES[:1]
-    states = states_of(*initiate(boxes, np.full((1, 4), 5.0)))
-    measured = Measurements.from_boxes(boxes + 2, SHAPE)
-    for dt, frames in ((0.04, 5.0), (0.4, 1.0)):
-        after = KalmanSmoother(params).correct(states, np.zeros(1), measured, dt)
-        noise = np.square(np.array([100, 90, 100, 90]) * params.measurement_noise) * frames
-        expected, _ = textbook(states.mean[0], states.cov[0], measured.boxes[0], noise)
-        np.testing.assert_allclose(after.mean[0], expected)
-        decay = max(math.exp(-dt / 0.15), 0.75)
-        errors = normalized(states.mean[0], states.cov[0], measured.boxes[0], noise)
-        np.testing.assert_allclose(after.innovation_mean[0], (1 - decay) * errors)
 
 
 def test_the_motion_of_a_vehicle_that_was_not_detected_for_long_is_unknown():

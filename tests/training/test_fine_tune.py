@@ -1,5 +1,4 @@
 import dataclasses
-import functools
 
 import numpy as np
 import pytest
@@ -8,7 +7,7 @@ torch = pytest.importorskip("torch", reason="training needs PyTorch, the extra [
 pytest.importorskip("onnx", reason="export needs onnx, the extra [train]")
 
 from tests.helpers import drawn  # noqa: E402
-from tests.training.networks import random_network  # noqa: E402
+from tests.training.networks import shrink_samples, write_initial  # noqa: E402
 from vehicle_detection.errors import InvalidInputError, ModelFileError  # noqa: E402
 from vehicle_detection.evaluation import LabelledFrames  # noqa: E402
 from vehicle_detection.network import load_network  # noqa: E402
@@ -16,11 +15,9 @@ from vehicle_detection.tables import TrackTable  # noqa: E402
 from vehicle_detection.training import (  # noqa: E402
     FrameDataset,
     detect_logits,
-    export_network,
     fine_tune,
     fine_tune_network,
     fingerprint,
-    network,
 )
 from vehicle_detection.training.fine_tune import hold_out  # noqa: E402
 
@@ -29,21 +26,12 @@ SOURCES = [FrameDataset("road", (drawn(range(5)),)), FrameDataset("coast", (draw
 
 @pytest.fixture(scope="module")
 def initial(tmp_path_factory):
-    """A file of a network that was never trained, whose boxes all count."""
-    path = tmp_path_factory.mktemp("initial") / "initial.onnx"
-    params = {"input_size": 160, "slope": 1.0, "offset": 0.0, "threshold": -9.0, "nms_iou": 0.6}
-    path.write_bytes(export_network(random_network(), [], params, {}, quantize=False))
-    return path
+    return write_initial(tmp_path_factory.mktemp("initial") / "initial.onnx")
 
 
 @pytest.fixture(autouse=True)
 def small_samples(monkeypatch):
-    monkeypatch.setattr(fine_tune, "_SIZE", (96, 64))
-    monkeypatch.setattr(fine_tune, "_BATCH", 2)
-    plain = functools.partial(export_network, quantize=False)  # in a fifth of the time
-    monkeypatch.setattr(fine_tune, "export_network", plain)
-    monkeypatch.setattr(network, "_REPORT_SECONDS", 0)
-    monkeypatch.setattr(network, "_CHECKPOINT_SECONDS", 0)
+    shrink_samples(monkeypatch)
 
 
 def tune(initial, sources=SOURCES, **options):

@@ -15,6 +15,7 @@ from moviepy import (
     vfx,
 )
 
+from tests.helpers import find_red
 from tests.video.clips import write_clip
 from vehicle_detection.annotator import Annotator, DrawParams
 from vehicle_detection.errors import InvalidInputError
@@ -29,13 +30,6 @@ def frame_with(left):
     frame = np.full((*SHAPE, 3), 90, np.uint8)
     frame[50:80, left : left + 40] = (240, 15, 15)
     return frame
-
-
-def find_red(image):
-    rows, columns = np.nonzero((image[..., 0] > 180) & (image[..., 1] < 90))
-    if not len(rows):
-        return [], []
-    return [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]], [0.9]
 
 
 def clip_of(count=20, fps=25, start=20):

@@ -10,11 +10,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from moviepy import VideoFileClip
 from moviepy.config import FFMPEG_BINARY
 
 from tests.helpers import StubDetector
-from tests.video.clips import NTSC, ffmpeg, ffmpeg_log, frame_numbers, sound_seconds
+from tests.video.clips import NTSC, ffmpeg, ffmpeg_log, frame_numbers
 from vehicle_detection.errors import InvalidInputError, TransientVideoError
 from vehicle_detection.video import (
     Encoding,
@@ -60,14 +59,6 @@ def test_a_complete_video_keeps_frames_rate_and_sound(clip, tmp_path):
     assert target.stat().st_mode & 0o444 == 0o444
 
 
-def test_a_part_of_a_video_with_its_sound(clip, tmp_path):
-    target = tmp_path / "out.mp4"
-    report = process_video(clip, target, StubDetector(), start=float(5 / NTSC), end=float(15 / NTSC))
-    assert report.frames == 10
-    assert frame_numbers(target) == list(range(5, 15))
-    assert sound_seconds(target) == pytest.approx(float(10 / NTSC), abs=0.03)
-
-
 def test_sound_can_be_omitted_and_an_end_after_the_video_is_ignored(clip, tmp_path):
     report = process_video(clip, tmp_path / "out.mp4", StubDetector(), audio=False, start=0.5, end=1e3)
     assert report.frames == 5
@@ -82,16 +73,6 @@ def test_without_a_target_nothing_is_drawn(clip, tmp_path):
     assert len(results) == report.frames == 20
     assert list(report.stages) == ["decode", "search", "heat", "track"]
     assert report.stages["search"] > 0
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # moviepy leaves pipes open
-def test_an_image_transform_of_moviepy_can_be_a_detector(clip, tmp_path):
-    target = tmp_path / "moviepy.mp4"
-    with VideoFileClip(str(clip)) as source:
-        source.image_transform(StubDetector()).write_videofile(
-            str(target), preset="ultrafast", logger=None, temp_audiofile_path=str(tmp_path)
-        )
-    assert frame_numbers(target) == list(range(20))
 
 
 def test_progress_is_shown_on_a_terminal_only(clip, monkeypatch):
@@ -213,19 +194,6 @@ def test_any_file_name(clip, tmp_path, monkeypatch, name):
     Path(name).write_bytes(clip.read_bytes())
     process_video(name, f"out {name}", StubDetector())
     assert frame_numbers(f"out {name}") == list(range(20))
-
-
-@pytest.mark.realdata
-@pytest.mark.parametrize(
-    ("name", "frames", "sound"), [("test_video.mp4", 38, True), ("lane_lines_960x540.mp4", 221, True)]
-)
-def test_real_clips_keep_frames_and_sound(real_data, tmp_path, name, frames, sound):
-    source, target = real_data / "videos" / name, tmp_path / "out.mp4"
-    report = process_video(source, target, StubDetector(), encoding=Encoding(preset="ultrafast"))
-    before, after = probe_video(source), probe_video(target)
-    assert report.frames == frames
-    assert (after.frames, after.fps, after.shape) == (before.frames, before.fps, before.shape)
-    assert after.has_audio == sound
 
 
 def test_the_quality_is_chosen(clip, tmp_path):
