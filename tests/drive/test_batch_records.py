@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from vehicle_detection.drive import batch_status, batch_summary, batch_trip
-from vehicle_detection.drive.batch_store import open_store, write_record
+from vehicle_detection.drive.batch_store import open_store
 from vehicle_detection.drive.trips import Trip
 from vehicle_detection.errors import OutputError
 
@@ -43,8 +43,8 @@ def test_a_record_removes_its_own_files_only(tmp_path):
     store = open_store(tmp_path / "out")
     for victim, path in zip(victims, ("tracks/../../victim", "tracks/date=a/camera=b/2-2.parquet")):
         victim.write_text("precious")
-        write_record(
-            store, {"key": "1-1", "status": "done", "sources": [{"uri": "a"}], "outputs": {"tracks": path}}
+        store.write_record(
+            {"key": "1-1", "status": "done", "sources": [{"uri": "a"}], "outputs": {"tracks": path}}
         )
         batch_trip._remove_earlier(
             store, {"key": "1-3", "date": "c", "camera": "d", "replaces": ["1-1"]}, {"status": "done"}
@@ -73,7 +73,7 @@ def test_locks_and_records_of_others_are_neither_followed_nor_emptied(kind, tmp_
         pass
     assert batch_status(folder).done == 0
     if kind != "pipe":
-        write_record(store, {"key": "1-1"})
+        store.write_record({"key": "1-1"})
         assert (folder / "records" / "1-1.json").read_text() != "precious"
     assert victim.read_text() == "precious"
 

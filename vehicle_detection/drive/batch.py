@@ -35,9 +35,6 @@ from vehicle_detection.drive.batch_store import (
     Store,
     is_complete,
     open_store,
-    read_records,
-    record_keys,
-    write_record,
 )
 from vehicle_detection.drive.batch_trip import (
     BUSY,
@@ -291,7 +288,7 @@ def _plan(
     trips = group_files(files, group)
     fingerprint = fingerprint_of(settings)
     earlier: dict[str, list[str]] = {}  # keys of records by the identity of their trip
-    for key in record_keys(store):
+    for key in store.record_keys():
         earlier.setdefault(identity_of(key), []).append(key)
     number, count = part
     tasks = []
@@ -335,7 +332,7 @@ def _longer_records(
     outputs = (path.rpartition("/") for path in store.list_files("tracks"))
     keys = {name.partition(".")[0] for place, _, name in outputs if place in places}
     found: dict[str, dict[str, Any]] = {}
-    for record in read_records(store, sorted(keys)).values():
+    for record in store.read_records(sorted(keys)).values():
         if record["status"] == DONE and is_complete(record, store.exists):
             found |= {source["uri"]: record for source in record["sources"][1:]}
     return found
@@ -366,7 +363,7 @@ def _pending(
 
     Also returns complete trips that still have earlier results to be removed.
     """
-    records = read_records(store, (task["key"] for task in tasks if task["recorded"]))
+    records = store.read_records(task["key"] for task in tasks if task["recorded"])
     outputs = {path for kind in ("tracks", "videos") for path in store.list_files(kind)} if records else set()
     pending, superseded = [], []
     for task in tasks:
@@ -435,7 +432,7 @@ def _outcome(
             return None
         record = _error_record(task, hide_credentials(f"{error}, {_ATTEMPTS} times"))
     try:
-        write_record(store, record)
+        store.write_record(record)
     except (OSError, InvalidInputError) as unwritten:
         record["message"] += f"; {unwritten}"
     return record | {"new": True}

@@ -204,6 +204,30 @@ class Store:
         with contextlib.suppress(FileNotFoundError):
             self._request(f"/{path} cannot be removed", lambda: self._filesystem.rm_file(self._path(path)))
 
+    def record_keys(self) -> list[str]:
+        """Keys of all records."""
+        paths = self.list_files(_FOLDER)
+        return [path.rpartition("/")[2].removesuffix(".json") for path in paths if path.endswith(".json")]
+
+    def read_records(self, keys: Iterable[str] | None = None) -> dict[str, dict[str, Any]]:
+        """Read the records of trips, or of all, by their keys; missing or damaged ones are left out."""
+        return {record["key"]: record for record in self.iterate_records(keys)}
+
+    def iterate_records(self, keys: Iterable[str] | None = None) -> Iterator[dict[str, Any]]:
+        """Yield the records of `read_records` one after the other, so that none has to be kept."""
+        paths = {_record_path(key): key for key in (self.record_keys() if keys is None else keys)}
+        for path, data in self.read_many(paths):
+            if (record := _parse(paths[path], data)) is not None:
+                yield record
+
+    def write_record(self, record: Mapping[str, Any]) -> None:
+        """Write the record of a trip."""
+        self.put(_record_path(record["key"]), (json.dumps(record, indent=1) + "\n").encode())
+
+    def remove_record(self, key: str) -> None:
+        """Remove the record of a trip, if there is one."""
+        self.remove(_record_path(key))
+
     @contextlib.contextmanager
     def lock(self, name: str) -> Iterator[bool]:
         """Lock a name against other processes during a block; yields False if another process holds it.
@@ -297,21 +321,8 @@ def with_source(source: str, message: str) -> str:
     return message if " ".join(source.split()) in message else f"{source}: {message}"
 
 
-def record_path(key: str) -> str:
-    """Path of the record of a trip in its store."""
+def _record_path(key: str) -> str:
     return f"{_FOLDER}/{key}.json"
-
-
-def read_records(store: Store, keys: Iterable[str] | None = None) -> dict[str, dict[str, Any]]:
-    """Read the records of trips, or of all, by their keys; missing or damaged ones are left out."""
-    return {record["key"]: record for record in iterate_records(store, keys)}
-
-
-def iterate_records(store: Store, keys: Iterable[str] | None = None) -> Iterator[dict[str, Any]]:
-    """Yield the records of `read_records` one after the other, so that none has to be kept."""
-    for path, data in store.read_many(map(record_path, record_keys(store) if keys is None else keys)):
-        if (record := _parse(_key(path), data)) is not None:
-            yield record
 
 
 def _is_output(key: str, path: str) -> bool:
@@ -348,15 +359,6 @@ def _parse(key: str, data: bytes) -> dict[str, Any] | None:
     return record
 
 
-def _key(path: str) -> str:
-    return path.rpartition("/")[2].removesuffix(".json")
-
-
-def write_record(store: Store, record: Mapping[str, Any]) -> None:
-    """Write the record of a trip."""
-    store.put(record_path(record["key"]), (json.dumps(record, indent=1) + "\n").encode())
-
-
 def is_complete(record: Mapping[str, Any] | None, exists: Callable[[str], bool]) -> bool:
     """Whether a trip need not be processed again: its outputs exist, or its source is known to be bad.
 
@@ -365,11 +367,6 @@ def is_complete(record: Mapping[str, Any] | None, exists: Callable[[str], bool])
     if record is None or record["status"] == ERROR:
         return False
     return all(map(exists, record["outputs"].values()))
-
-
-def record_keys(store: Store) -> list[str]:
-    """Keys of all records."""
-    return [_key(path) for path in store.list_files(_FOLDER) if path.endswith(".json")]
 
 
 def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
@@ -384,7 +381,7 @@ def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
     """
     counts, sums = Counter[str](), Counter[str]()
     messages: dict[str, str] = {}
-    for record in iterate_records(open_store(out)):
+    for record in open_store(out).iterate_records():
         counts[record["status"]] += 1
         if record["status"] == DONE:
             for name in _NUMBERS:
@@ -413,7 +410,7 @@ def batch_summary(out: str | os.PathLike[str]) -> pandas.DataFrame:
     """
     import pandas
 
-    rows = [_summary_row(record) for record in iterate_records(open_store(out))]
+    rows = [_summary_row(record) for record in open_store(out).iterate_records()]
     rows.sort(key=lambda row: (row["date"] or "", row["camera"] or "", row["first_file"]))
     return pandas.DataFrame(rows, columns=_SUMMARY_COLUMNS)
 

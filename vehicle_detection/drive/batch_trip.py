@@ -43,9 +43,6 @@ from vehicle_detection.drive.batch_store import (
     Store,
     is_complete,
     open_store,
-    read_records,
-    record_path,
-    write_record,
 )
 from vehicle_detection.drive.trips import Trip, find_trips
 from vehicle_detection.errors import (
@@ -71,8 +68,6 @@ from vehicle_detection.video import (
 
 _ID_DIGITS = _HASH_DIGITS = 12
 _HTTP_TIMEOUT = 10
-# Answers to a HEAD request after which a GET may succeed, such as that of a URL signed for GET only.
-_NO_HEAD = (400, 401, 403, 405, 501)
 
 Facts = Mapping[str, Any]
 """What storage states about a file when it lists it, such as its size and entity tag; empty if unknown."""
@@ -231,16 +226,14 @@ def _identify(uri: str, facts: Facts) -> dict[str, Any]:
 def _identify_http(url: str) -> dict[str, Any]:
     import requests
 
-    answer = requests.head(url, timeout=_HTTP_TIMEOUT, allow_redirects=True)
-    if answer.status_code in _NO_HEAD:
-        first_byte = {"Range": "bytes=0-0"}
-        answer = requests.get(url, timeout=_HTTP_TIMEOUT, headers=first_byte, stream=True)
-        answer.close()
+    # Not a HEAD request: a URL may be signed for GET only.
+    first_byte = {"Range": "bytes=0-0"}
+    with requests.get(url, timeout=_HTTP_TIMEOUT, headers=first_byte, stream=True) as answer:
+        headers = answer.headers
     if answer.status_code >= 500:
         answer.raise_for_status()
     if not answer.ok:
         return {"size": None, "tag": ""}
-    headers = answer.headers
     length = headers.get("Content-Range", "").rpartition("/")[2] or headers.get("Content-Length", "")
     return {
         "size": int(length) if length.isdecimal() else None,
@@ -330,7 +323,7 @@ def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
         with store.lock(identity_of(key)) as locked:
             if not locked:
                 return {"key": key, "status": BUSY, "sources": task["sources"]}
-            record = read_records(store, [key]).get(key)
+            record = store.read_records([key]).get(key)
             if record is None or task["again"] or not is_complete(record, store.exists):
                 return _run_locked(store, task) | {"new": True}
             _remove_earlier(store, task, record)
@@ -352,7 +345,7 @@ def _run_locked(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
     try:
         if record["status"] != ERROR:  # an error of the machine replaces nothing
             _remove_earlier(store, task, record)
-        write_record(store, record)
+        store.write_record(record)
     except (OSError, InvalidInputError) as error:  # a full disk, no access: the next run repeats the trip
         record |= {"status": ERROR, "message": str(error)}
     return record
@@ -477,12 +470,12 @@ def _remove_earlier(store: Store, task: Mapping[str, Any], facts: Mapping[str, A
     `facts` are those of the trip's new record, whose outputs are kept. A failure replaces no results.
     """
     failed, outputs = facts["status"] != DONE, facts.get("outputs", {})
-    for key, record in read_records(store, task.get("replaces", ())).items():
+    for key, record in store.read_records(task.get("replaces", ())).items():
         if failed and record["status"] == DONE:
             continue
         for path in record["outputs"].values():
             store.remove(path)
-        store.remove(record_path(key))
+        store.remove_record(key)
     if failed:
         return
     # Outputs of another run at the same time, or of a killed process that has not written their record.
@@ -491,4 +484,4 @@ def _remove_earlier(store: Store, task: Mapping[str, Any], facts: Mapping[str, A
         for path in store.list_files(f"{kind}/{place}", f"{identity}-"):
             if path not in outputs.values():
                 store.remove(path)
-                store.remove(record_path(path.rpartition("/")[2].partition(".")[0]))
+                store.remove_record(path.rpartition("/")[2].partition(".")[0])

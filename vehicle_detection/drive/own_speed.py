@@ -9,9 +9,10 @@ import logging
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -257,32 +258,42 @@ def _read_csv(data: bytes, name: str) -> Floats:
             f"path {name} must have the columns time_s and one of {', '.join(_SPEED_COLUMNS)}; "
             f"got {shorten(', '.join(header), 300) or 'no header'}"
         )
-    place = [header.index(column) for column in ("latitude", "longitude") if column in header]
-    rows = []
-    for number, row in enumerate(table[1:], start=2):
-        if not any(cell.strip() for cell in row):
-            continue
-        where = f"path {name}, line {number}"
-        try:
-            time, speed = (float(row[header.index(column)]) for column in ("time_s", unit))
-        except (ValueError, IndexError):
-            raise InvalidInputError(f"{where}: time_s and {unit} must be numbers; correct the line") from None
-        speed *= _SPEED_COLUMNS[unit]
-        if not math.isfinite(time) or not 0 <= speed <= _MAX_SPEED:
-            expected = f"the speed must be from 0 to {_MAX_SPEED:g} m/s at a finite time"
-            raise InvalidInputError(f"{where}: {expected}; got {shorten(','.join(row))}")
-        cells = [row[column] if column < len(row) else "" for column in place]
-        rows.append((time, speed, *(_position(*cells) if len(cells) == 2 else _NOWHERE)))
+    rows = {number: row for number, row in enumerate(table[1:], start=2) if any(map(str.strip, row))}
     if not rows:
         raise InvalidInputError(f"path {name} has no rows below its header")
-    return _ascending(np.array(rows))
+    columns = {cells[0]: cells[1:] for cells in zip_longest(header, *rows.values(), fillvalue="")}
+    times = _numbers(columns["time_s"])
+    speeds = _numbers(columns[unit]) * _SPEED_COLUMNS[unit]
+    wrong = ~np.isfinite(times) | ~((speeds >= 0) & (speeds <= _MAX_SPEED))
+    if wrong.any():
+        number, row = list(rows.items())[int(np.argmax(wrong))]
+        raise InvalidInputError(
+            f"path {name}, line {number}: time_s and {unit} must be numbers, and the speed from 0 to "
+            f"{_MAX_SPEED:g} m/s; got {shorten(','.join(row))}"
+        )
+    places = [columns.get(column, [""] * len(rows)) for column in ("latitude", "longitude")]
+    return _ascending(np.column_stack([times, speeds, *_positions(*places)]))
 
 
-_NOWHERE = (math.nan, math.nan)
+def _positions(latitudes: Iterable[Any], longitudes: Iterable[Any]) -> tuple[Floats, Floats]:
+    return _numbers(latitudes, -90, 90), _numbers(longitudes, -180, 180)
 
 
-def _position(latitude: str | None, longitude: str | None) -> tuple[float, float]:
-    return _parse_float(latitude, -90, 90), _parse_float(longitude, -180, 180)
+def _numbers(values: Iterable[Any], low: float = -math.inf, high: float = math.inf) -> Floats:
+    """Return texts or numbers as numbers in a range, with NaN for anything else."""
+    import pandas
+
+    numbers = pandas.to_numeric(pandas.Series([*values], dtype=object), errors="coerce")
+    return np.asarray(numbers.where(numbers.between(low, high)), np.float64)
+
+
+def _seconds(texts: Iterable[str]) -> Floats:
+    """Return times (ISO 8601, without a zone UTC) as seconds since 1970, with NaN for anything else."""
+    import pandas
+
+    texts = pandas.Series([*texts], dtype=object).str.strip()
+    times = pandas.to_datetime(texts, format="ISO8601", utc=True, errors="coerce")
+    return np.asarray((times - pandas.Timestamp(0, tz="UTC")).dt.total_seconds(), np.float64)
 
 
 class _NoDoctype(ElementTree.TreeBuilder):
@@ -290,25 +301,6 @@ class _NoDoctype(ElementTree.TreeBuilder):
 
     def doctype(self, *_: Any) -> None:
         raise InvalidInputError("it has a document type declaration, which GPX does not need; remove it")
-
-
-def _parse_float(text: str | None, low: float, high: float) -> float:
-    """Return a number in this range; NaN for anything else."""
-    try:
-        value = float(text or "nan")
-    except ValueError:
-        return math.nan
-    return value if low <= value <= high else math.nan
-
-
-def _parse_time(text: str) -> float:
-    """Return an ISO 8601 time as seconds since 1970; NaN for anything else. Without a zone it is UTC."""
-    # Python 3.11 accepts up to 6 decimals, but any number is allowed.
-    try:
-        time = datetime.fromisoformat(re.sub(r"(\.\d{6})\d+", r"\1", text.strip()))
-        return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
-    except (ValueError, OverflowError):
-        return math.nan
 
 
 def _check_zones(points: Floats, texts: Sequence[str], name: str) -> None:
@@ -344,15 +336,9 @@ def _read_gpx(data: bytes, name: str) -> Floats:
     # GPX 1.0 and 1.1 have different namespaces; the speed of version 1.1 is in an extension.
     points = list(document.iterfind(".//{*}trkpt"))
     times = [point.findtext(".//{*}time") or "" for point in points]
-    rows = [
-        (
-            _parse_time(time),
-            _parse_float(point.findtext(".//{*}speed"), 0, 4 * _MAX_SPEED),
-            *_position(point.get("lat"), point.get("lon")),
-        )
-        for point, time in zip(points, times, strict=True)
-    ]
-    found = np.array(rows).reshape(-1, 4)
+    speeds = _numbers((point.findtext(".//{*}speed") for point in points), 0, 4 * _MAX_SPEED)
+    places = _positions(*([point.get(axis) for point in points] for axis in ("lat", "lon")))
+    found = np.column_stack([_seconds(times), speeds, *places])
     _check_zones(found, times, name)
     return found
 
@@ -365,19 +351,20 @@ _RMC = re.compile(
 
 def _read_nmea(data: bytes, name: str) -> Floats:
     """Read the points of valid RMC sentences, with times since 1970."""
-    rows = []
+    rows = list[tuple[Any, ...]]()
     for found in _RMC.finditer(data.decode("ascii", "replace")):
         _, hour, minute, second, lat, lat_minutes, south, lon, lon_minutes, west, knots, *date, given = (
             found.groups()
         )
         if functools.reduce(lambda bits, letter: bits ^ ord(letter), found["text"], 0) == int(given, 16):
             day, month, year = date
-            time = _parse_time(f"20{year}-{month}-{day}T{hour}:{minute}:{second[:2]}")
+            time = f"20{year}-{month}-{day}T{hour}:{minute}:{second}"
             north = (int(lat) + float(lat_minutes) / 60) * (-1 if south == "S" else 1)
             east = (int(lon) + float(lon_minutes) / 60) * (-1 if west == "W" else 1)
-            speed = _parse_float(knots, 0, 4 * _MAX_SPEED) / _OTHER_UNITS["knots"]
-            rows.append((time + float(second) % 1, speed, *_position(str(north), str(east))))
-    return np.array(rows).reshape(-1, 4)
+            rows.append((time, knots, north, east))
+    times, speeds, *places = zip(*rows) if rows else [()] * 4
+    in_mps = _numbers(speeds, 0, 4 * _MAX_SPEED) / _OTHER_UNITS["knots"]
+    return np.column_stack([_seconds(times), in_mps, *_positions(*places)])
 
 
 def _speeds_of(points: Floats) -> Floats:
