@@ -127,6 +127,29 @@ def test_false_boxes_in_frames_without_vehicles():
     assert (score.false_per_empty_frame, score.false_per_vehicle_free_frame) == (2.0, 1.5)
 
 
+class CountedFrames(dict):
+    """Frames that count how many of them have been read."""
+
+    read = 0
+
+    def __getitem__(self, key):
+        self.read += 1
+        return super().__getitem__(key)
+
+
+def test_frames_are_not_read_in_advance():
+    frames, read = CountedFrames.fromkeys(range(40), np.zeros((60, 160, 3), np.uint8)), []
+
+    def find(image):
+        read.append(frames.read)
+        return [], []
+
+    part = LabelledFrames("road", frames, TrackTable(frame_keys=range(40)))
+    detect_in_source(detector_from(find).model, FrameDataset("road", (part,)), jobs=2)
+    assert len(read) == 40
+    assert all(count <= number + 2 for number, count in enumerate(read))
+
+
 def test_detections_of_any_model():
     seen = []
 

@@ -81,9 +81,14 @@ class LabelledFrames:
     def __len__(self) -> int:
         return len(self.keys)
 
+    def __getitem__(self, key: FrameKey) -> NDArray[np.uint8]:
+        """Read the image of one frame."""
+        frames = self.frames
+        image = frames[frames.names.index(str(key))] if isinstance(frames, FrameSet) else frames[key]
+        return check.image(image, f"frame {key!r}")
+
     def __iter__(self) -> Iterator[tuple[FrameKey, NDArray[np.uint8]]]:
-        for key, image in self.frames.items() if isinstance(self.frames, Mapping) else self.frames:
-            yield key, check.image(image, f"frame {key!r}")
+        return ((key, self[key]) for key in self.keys)
 
     @classmethod
     def from_video(

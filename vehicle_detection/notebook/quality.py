@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import check, describe
 from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
-from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import (
     LabelledFrames,
@@ -144,8 +143,7 @@ def plot_errors(
 
 def _crop(frames: LabelledFrames, key: FrameKey, box: NDArray[Any]) -> tuple[Image, tuple[int, int]]:
     """Cut out a square around the center of a box, 1.8 times its longer side; and its upper left corner."""
-    images = frames.frames
-    image = images[images.names.index(str(key))] if isinstance(images, FrameSet) else images[key]
+    image = frames[key]
     height, width = image.shape[:2]
     x, y = (box[:2] + box[2:]) / 2
     half = max(24.0, 0.9 * float((box[2:] - box[:2]).max()))

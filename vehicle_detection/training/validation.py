@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -171,11 +171,13 @@ def detect_in_source(
     lowest = check.number(min_score, "min_score")
     with model.open_search(jobs=1) as search, ThreadPoolExecutor(resolve_jobs(jobs)) as pool:
 
-        def detect(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Any]:
-            return pair[0], search.find(pair[1], None, min_vehicle_score=lowest).vehicles
+        def detect(part: LabelledFrames, key: FrameKey) -> Any:
+            # Each image is read when it is searched: `map` would read all of an iterator in advance.
+            return search.find(part[key], None, min_vehicle_score=lowest).vehicles
 
-        found = [TrackTable.from_detections(dict(pool.map(detect, part))) for part in source.sets]
-    return [FoldDetections(source.name, part, boxes) for part, boxes in zip(source.sets, found)]
+        found = [dict(zip(part.keys, pool.map(partial(detect, part), part.keys))) for part in source.sets]
+    tables = map(TrackTable.from_detections, found)
+    return [FoldDetections(source.name, part, table) for part, table in zip(source.sets, tables)]
 
 
 def score_fold(
