@@ -210,6 +210,17 @@ class TestNmea:
         np.testing.assert_allclose(found.at([0, 2.5, 4]), 10, rtol=1e-6)
         assert np.isnan(found.at([4.1]))
 
+    @pytest.mark.parametrize("date", ["310126", "060180"])
+    def test_the_record_starts_before_the_first_position(self, tmp_path, caplog, date):
+        """Unless the clock of the receiver is wrong until then."""
+        path = tmp_path / "a.nmea"
+        void = "".join(sentence(second, "", "V").replace("310126", date) for second in range(3))
+        path.write_text(void + "".join(sentence(second, 36 / 1.852) for second in range(3, 9)))
+        start = 3 if date == "310126" else 0
+        known = np.isfinite(read_own_speed(path).at(np.arange(10)))
+        assert known.tolist() == [start <= second < start + 6 for second in range(10)]
+        assert ("first position is 3 s after the first sentence" in caplog.text) == (start > 0)
+
     def test_other_files_are_refused(self, tmp_path):
         (tmp_path / "a.nmea").write_bytes(b"\xff no sentences")
         with pytest.raises(InvalidInputError, match="at least two track points with times, got 0"):

@@ -49,6 +49,7 @@ _OTHER_UNITS = {"km/h": 3.6, "mph": 1 / 0.44704, "knots": 3600 / 1852}
 # A time with its zone; seconds by which neighbouring points differ from it, and degrees between them.
 _ZONE, _ZONE_TOLERANCE, _NEAR = re.compile(r"T.*(Z|[+-]\d\d:?\d\d)\s*$", re.IGNORECASE), 10.0, 0.01
 _OUTLYING = 366 * 86400.0  # s from the median time, such as the dates of a receiver without satellites
+_LONGEST_START = 3600.0  # s that a receiver may need to find its position
 # Factors from the columns of a table to m/s.
 _SPEED_COLUMNS = {"speed_mps": 1.0, "speed_kmh": 1 / 3.6, "speed_mph": 0.44704}
 
@@ -344,13 +345,18 @@ def _read_gpx(data: bytes, name: str) -> Floats:
 
 
 _RMC = re.compile(
-    r"\$(?P<text>G[A-Z]RMC,(\d\d)(\d\d)(\d\d(?:\.\d+)?),A,(\d\d)([\d.]+),([NS]),(\d{3})([\d.]+),([EW]),"
-    r"([\d.]*),[^,]*,(\d\d)(\d\d)(\d\d)[^*\s]*)\*(?P<sum>[0-9A-F]{2})"
+    r"\$(?P<text>G[A-Z]RMC,(\d\d)(\d\d)(\d\d(?:\.\d+)?),"
+    r"(?:A,(\d\d)(\d+\.?\d*),([NS]),(\d{3})(\d+\.?\d*),([EW])|V,[\d.]*,[NS]?,[\d.]*,[EW]?),"
+    r"([\d.]*),[^,]*,(\d\d)(\d\d)(\d\d)[^*\s]*)\*(?P<sum>[0-9A-Fa-f]{2})"
 )
 
 
 def _read_nmea(data: bytes, name: str) -> Floats:
-    """Read the points of valid RMC sentences, with times since 1970."""
+    """Read the points of RMC sentences, with times since 1970.
+
+    A record begins with its first sentence. If the receiver has not found its position by then, the first
+    point has that time, and an unknown position and speed.
+    """
     rows = list[tuple[Any, ...]]()
     for found in _RMC.finditer(data.decode("ascii", "replace")):
         _, hour, minute, second, lat, lat_minutes, south, lon, lon_minutes, west, knots, *date, given = (
@@ -359,12 +365,32 @@ def _read_nmea(data: bytes, name: str) -> Floats:
         if functools.reduce(lambda bits, letter: bits ^ ord(letter), found["text"], 0) == int(given, 16):
             day, month, year = date
             time = f"20{year}-{month}-{day}T{hour}:{minute}:{second}"
+            if lat is None:
+                rows.append((time, None, None, None))
+                continue
             north = (int(lat) + float(lat_minutes) / 60) * (-1 if south == "S" else 1)
             east = (int(lon) + float(lon_minutes) / 60) * (-1 if west == "W" else 1)
             rows.append((time, knots, north, east))
     times, speeds, *places = zip(*rows) if rows else [()] * 4
     in_mps = _numbers(speeds, 0, 4 * _MAX_SPEED) / _OTHER_UNITS["knots"]
-    return np.column_stack([_seconds(times), in_mps, *_positions(*places)])
+    return _from_first_sentence(np.column_stack([_seconds(times), in_mps, *_positions(*places)]), name)
+
+
+def _from_first_sentence(points: Floats, name: str) -> Floats:
+    """Leave out points without a position, but keep the time of those before the first position."""
+    located = np.isfinite(points[:, 2])
+    if not located.any():
+        return points[located]
+    first = int(np.argmax(located))
+    seconds = points[first, 0] - points[:first, 0]
+    # The clock of a receiver without satellites may be wrong.
+    waiting = seconds[(seconds > 0) & (seconds < _LONGEST_START)].max(initial=0.0)
+    if not waiting:
+        return points[located]
+    _LOGGER.warning(
+        "%s: the first position is %g s after the first sentence, with which the video starts", name, waiting
+    )
+    return np.concatenate([[(points[first, 0] - waiting, *[math.nan] * 3)], points[located]])
 
 
 def _speeds_of(points: Floats) -> Floats:
