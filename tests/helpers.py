@@ -16,13 +16,10 @@ from types import SimpleNamespace
 import numpy as np
 
 from tests.network.graphs import own_network
-from vehicle_detection.boxes import clip_boxes
-from vehicle_detection.evaluation import LabelledFrames
-from vehicle_detection.images import write_image
+from vehicle_detection import LabelledFrames, TrackTable, clip_boxes, write_image
 from vehicle_detection.network import load_network
 from vehicle_detection.scenes import render_patches, render_scene
 from vehicle_detection.svm import Template, VehicleClassifier
-from vehicle_detection.tables import TrackTable
 
 ROOT = Path(__file__).parents[1]
 """Root of the repository."""

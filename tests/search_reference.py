@@ -12,17 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vehicle_detection import FeatureParams, InvalidInputError, VehicleClassifier, convert_color
 from vehicle_detection._common import check
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import (
-    PATCH_SIZE,
-    FeatureParams,
-    color_parts,
-    convert_color,
-    hog_blocks,
-    hog_source,
-)
-from vehicle_detection.svm import VehicleClassifier
+from vehicle_detection.features import PATCH_SIZE, color_parts, hog_blocks, hog_source
 
 
 def score_windows(

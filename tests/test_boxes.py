@@ -7,17 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from vehicle_detection.boxes import (
-    Detections,
-    box_areas,
-    clip_boxes,
-    intersection_matrix,
-    iou_matrix,
-    iter_nms,
-    non_max_suppression,
-    overlap_matrices,
-)
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection import Detections, InvalidInputError, clip_boxes, iou_matrix, non_max_suppression
+from vehicle_detection.boxes import box_areas, intersection_matrix, iter_nms, overlap_matrices
 
 
 def corners_to_boxes(array):

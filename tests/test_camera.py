@@ -7,16 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import SHAPE
-from vehicle_detection.camera import (
-    LENSES,
-    Camera,
-    lateral_offsets,
-    open_camera,
-    read_camera,
-    truncated_edges,
-    write_camera,
-)
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection import Camera, InvalidInputError, open_camera, read_camera, write_camera
+from vehicle_detection.camera import LENSES, lateral_offsets, truncated_edges
 
 CAMERA = Camera.for_frame(SHAPE)
 

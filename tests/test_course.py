@@ -21,9 +21,8 @@ from sklearn.tree import DecisionTreeClassifier
 
 import vehicle_detection.course as lesson
 from tests import lesson_reference as reference
-from vehicle_detection import Detections, read_image, write_image
+from vehicle_detection import Detections, InvalidInputError, read_image, write_image
 from vehicle_detection.course import search as search_module
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes import render_patches, render_scene
 from vehicle_detection.svm import UNIT_CHANNELS
 

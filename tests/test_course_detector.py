@@ -10,7 +10,7 @@ from sklearn.svm import LinearSVC
 
 import vehicle_detection.course as lesson
 from tests.helpers import rendered_patches
-from vehicle_detection import detector_from, load_classifier
+from vehicle_detection import TrackTable, detector_from, load_classifier, load_frames, read_labels
 from vehicle_detection.course import (
     Box,
     BoxSmoother,
@@ -22,12 +22,9 @@ from vehicle_detection.course import (
     reference,
 )
 from vehicle_detection.course.versions import lesson_defaults
-from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, evaluate_detections
-from vehicle_detection.formats import read_labels
 from vehicle_detection.scenes import render_scene
-from vehicle_detection.tables import TrackTable
 
 FEATURES = {"spatial_size": (16, 16), "hist_bins": 16, "divide_by": 1}
 

@@ -20,8 +20,7 @@ from sklearn.tree import DecisionTreeClassifier
 import vehicle_detection.course
 from tests import lesson_reference
 from tests.helpers import rendered_patches
-from vehicle_detection import read_image, write_image
-from vehicle_detection.scenes import render_scene
+from vehicle_detection import read_image, render_scene, write_image
 
 pytestmark = pytest.mark.filterwarnings("ignore:the image has values 0-1, which")
 

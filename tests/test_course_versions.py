@@ -13,11 +13,9 @@ from sklearn.svm import LinearSVC
 
 import vehicle_detection.course as course
 from tests.helpers import rendered_patches
-from vehicle_detection import write_image
+from vehicle_detection import InvalidInputError, render_scene, write_image
 from vehicle_detection.course import detect_versions, reference, set_lesson_defaults
 from vehicle_detection.course.versions import lesson_defaults
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.scenes import render_scene
 
 pytestmark = [
     pytest.mark.usefixtures("restored_defaults"),

@@ -12,21 +12,16 @@ import pytest
 
 import vehicle_detection
 from tests.helpers import ROOT
+from vehicle_detection import HeatParams, RegionParams, TrackTable, iou_matrix, load_frames, read_labels
 from vehicle_detection.annotator import Annotator, DrawParams
-from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.camera import Camera, write_camera
-from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import Detector, VehicleDetector, load_model
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, evaluate_detections
 from vehicle_detection.features import FeatureParams
-from vehicle_detection.formats import read_labels
-from vehicle_detection.heatmap import HeatParams
-from vehicle_detection.regions import RegionParams
 from vehicle_detection.scenes import SceneVehicle, render_drive, render_scene
 from vehicle_detection.search import SearchBand, SearchParams
 from vehicle_detection.svm import Template, VehicleClassifier
-from vehicle_detection.tables import TrackTable
 from vehicle_detection.tracking import FrameResult, Tracker, TrackParams
 
 # Most of these frames come without times.

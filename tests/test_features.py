@@ -7,20 +7,17 @@ from hypothesis import strategies as st
 
 from tests.feature_cases import BLANK, PATCHES
 from tests.helpers import rendered_patches
-from vehicle_detection._kernels import features as kernels
-from vehicle_detection._kernels.features import degree_bounds
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import (
-    COLOR_SPACES,
-    HOG_CHANNELS,
-    SPATIAL_ORDERS,
+from vehicle_detection import (
     FeatureParams,
+    InvalidInputError,
     convert_color,
     extract_features,
-    hog_blocks,
     single_img_features,
+    write_image,
 )
-from vehicle_detection.images import write_image
+from vehicle_detection._kernels import features as kernels
+from vehicle_detection._kernels.features import degree_bounds
+from vehicle_detection.features import COLOR_SPACES, HOG_CHANNELS, SPATIAL_ORDERS, hog_blocks
 
 PRESETS = sorted(FeatureParams.PRESETS)
 # The kernels work in float32, the reference in float64; HOG values lie in 0-1.

@@ -12,14 +12,10 @@ from sklearn.svm import LinearSVC
 
 from tests.helpers import find_red
 from tests.video.clips import write_clip
-from vehicle_detection.detector import VehicleDetector
+from vehicle_detection import Explorer, HeatParams, TrackTable, VehicleDetector, process_video
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.evaluation import evaluate_tracks
 from vehicle_detection.function_model import FunctionModel, FunctionParams, detector_from
-from vehicle_detection.heatmap import HeatParams
-from vehicle_detection.notebook import Explorer
-from vehicle_detection.tables import TrackTable
-from vehicle_detection.video import process_video
 
 SHAPE = (120, 200)
 BOX = [40, 50, 80, 80]

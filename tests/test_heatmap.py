@@ -5,8 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import ndimage
 
-from vehicle_detection.boxes import Detections
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection import Detections, InvalidInputError
 from vehicle_detection.heatmap import (
     HeatHistory,
     HeatParams,

@@ -7,14 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection import FunctionParams, InvalidInputError, NetworkParams, RegionParams, TrackParams
 from vehicle_detection.features import FeatureParams, extract_features, single_img_features
-from vehicle_detection.function_model import FunctionParams
 from vehicle_detection.heatmap import HeatParams, heat_range
-from vehicle_detection.network import NetworkParams
-from vehicle_detection.regions import RegionParams
 from vehicle_detection.search import PixelBand, SearchBand, SearchParams
-from vehicle_detection.tracking import TrackParams
 from vehicle_detection.windows import band_windows
 
 PARTS = ("spatial_feat", "hist_feat", "hog_feat")

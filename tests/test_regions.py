@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_detection.boxes import Detections, iou_matrix
-from vehicle_detection.camera import Camera
-from vehicle_detection.regions import RegionParams, find_vehicles, fit_boxes, group_windows
+from vehicle_detection import Camera, Detections, RegionParams, find_vehicles, iou_matrix
+from vehicle_detection.regions import fit_boxes, group_windows
 
 SHAPE = (720, 1280)
 CAMERA = Camera.for_frame(SHAPE)

@@ -11,12 +11,10 @@ from hypothesis import strategies as st
 
 from tests.helpers import random_classifier
 from tests.search_reference import score_windows
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection import InvalidInputError, VehicleClassifier, find_cars, search_windows, slide_window
 from vehicle_detection.features import COLOR_SPACES, FeatureParams
 from vehicle_detection.search import PixelBand, SearchBand, SearchParams, resize_band, resized_shape
-from vehicle_detection.svm import VehicleClassifier
 from vehicle_detection.training import to_pipeline
-from vehicle_detection.windows import find_cars, search_windows, slide_window
 
 PRESETS = sorted(FeatureParams.PRESETS)
 TOLERANCE = 1e-4

@@ -13,12 +13,9 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import MaxAbsScaler, MinMaxScaler, RobustScaler, StandardScaler
 from sklearn.svm import SVC, LinearSVC
 
-from vehicle_detection import course
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection import InvalidInputError, VehicleClassifier, course, render_patches
 from vehicle_detection.features import FeatureParams, extract_features
-from vehicle_detection.scenes import render_patches
 from vehicle_detection.search import PixelBand
-from vehicle_detection.svm import VehicleClassifier
 from vehicle_detection.training import PatchFeatures
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)

@@ -16,13 +16,11 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
 from tests.helpers import failing, random_classifier
+from vehicle_detection import FeatureParams, PatchSet, extract_features, write_image
 from vehicle_detection._common import FORMAT_VERSION, blur_patches, degrade_patches, mirror_patches
 from vehicle_detection._common.model_file import FORMAT, checksum
 from vehicle_detection._kernels import fit_svm
-from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.features import FeatureParams, extract_features
-from vehicle_detection.images import write_image
 from vehicle_detection.svm import KIND, Template, VehicleClassifier, load_classifier
 from vehicle_detection.training import TrainingOptions, patch_features, to_pipeline, train_classifier
 

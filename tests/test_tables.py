@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.evaluation.cases import CAR, boxes_of, moved
-from vehicle_detection.boxes import Detections
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.tables import LABEL_COLUMNS, TRACK_COLUMNS, TrackTable
+from vehicle_detection import Detections, InvalidInputError, TrackTable
+from vehicle_detection.tables import LABEL_COLUMNS, TRACK_COLUMNS
 
 PRESENCE = st.lists(st.sets(st.integers(1, 4)), max_size=40)
 

@@ -6,10 +6,7 @@ from hypothesis import strategies as st
 
 from tests.helpers import random_classifier
 from tests.search_reference import score_windows
-from vehicle_detection import course
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import FeatureParams, single_img_features
-from vehicle_detection.search import SearchParams
+from vehicle_detection import FeatureParams, InvalidInputError, SearchParams, course, single_img_features
 from vehicle_detection.windows import band_windows, search_windows, slide_window
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)

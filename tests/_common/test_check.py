@@ -9,10 +9,8 @@ import numpy as np
 import pandas
 import pytest
 
+from vehicle_detection import Detections, InvalidInputError, PatchSet
 from vehicle_detection._common import check, describe, fields
-from vehicle_detection.boxes import Detections
-from vehicle_detection.datasets import PatchSet
-from vehicle_detection.errors import InvalidInputError
 
 IMAGE = np.zeros((4, 6, 3), np.uint8)
 PATCH = np.zeros((64, 64, 3), np.uint8)

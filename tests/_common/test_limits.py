@@ -6,12 +6,9 @@ import zipfile
 
 import pytest
 
+from vehicle_detection import load_model, load_patches, read_camera, read_labels
 from vehicle_detection._common import Limit, check, read_regular_file
-from vehicle_detection.camera import read_camera
-from vehicle_detection.datasets import load_patches
-from vehicle_detection.detector import load_model
 from vehicle_detection.errors import DatasetError, InvalidInputError, ModelFileError
-from vehicle_detection.formats import read_labels
 
 READERS = [
     (load_model, ModelFileError, "VEHICLE_DETECTION_MAX_MODEL_BYTES"),

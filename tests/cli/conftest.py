@@ -3,9 +3,8 @@
 import pytest
 
 from tests.cli.commands import write_patches
+from vehicle_detection import render_drive, write_image
 from vehicle_detection.cli.demo import draw_clip
-from vehicle_detection.images import write_image
-from vehicle_detection.scenes import render_drive
 
 
 @pytest.fixture(scope="session")

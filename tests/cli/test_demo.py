@@ -2,10 +2,8 @@ import re
 from dataclasses import replace
 
 from tests.cli.commands import contents, succeed
+from vehicle_detection import probe_video, read_image, render_drive
 from vehicle_detection.cli.demo import FILES, REPORT, SHEET, scored_truth
-from vehicle_detection.images import read_image
-from vehicle_detection.scenes import render_drive
-from vehicle_detection.video import probe_video
 
 
 def test_demo_draws_annotates_and_scores(tmp_path):

@@ -11,12 +11,8 @@ import pytest
 from tests.cli.commands import HEADER, contents, refuse, refuse_each, run, succeed
 from tests.network.graphs import constant_network
 from tests.video.clips import write_clip
-from vehicle_detection import detector
-from vehicle_detection.formats import read_labels
-from vehicle_detection.images import read_image, write_image
-from vehicle_detection.results import ImageDetections
+from vehicle_detection import ImageDetections, detector, read_frames, read_image, read_labels, write_image
 from vehicle_detection.scenes import SceneVehicle, render_scene
-from vehicle_detection.video import read_frames
 
 
 def road(*places, **options):

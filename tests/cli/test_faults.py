@@ -26,12 +26,10 @@ from tests.cli.commands import (
 )
 from tests.helpers import ROOT, failing, wait_until
 from tests.video.clips import gray_frames, write_clip
-from vehicle_detection import detector
+from vehicle_detection import detector, render_scene, write_image
 from vehicle_detection._kernels.jit import jit
 from vehicle_detection.drive import events
 from vehicle_detection.drive import outputs as event_files
-from vehicle_detection.images import write_image
-from vehicle_detection.scenes import render_scene
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
 

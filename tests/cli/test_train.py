@@ -7,10 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.cli.commands import contents, patches_of, refuse, refuse_each, succeed
-from vehicle_detection.detector import load_model
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.images import write_image
-from vehicle_detection.svm import VehicleClassifier, load_classifier
+from vehicle_detection import InvalidInputError, VehicleClassifier, load_classifier, load_model, write_image
 
 
 def test_train_writes_model_report_and_card(material, tmp_path):

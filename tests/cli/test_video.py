@@ -14,15 +14,12 @@ import pytest
 from tests.cli.commands import HEADER, contents, refuse, refuse_each, run, succeed
 from tests.helpers import failing
 from tests.video.clips import damage_sizes, write_clip
-from vehicle_detection import video
-from vehicle_detection.annotator import DrawParams
+from vehicle_detection import DrawParams, InvalidInputError, probe_video, read_frames, render_drive, video
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.cli.options import parse_time
 from vehicle_detection.cli.video import read_speed
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.scenes import render_drive
 from vehicle_detection.tracking import HorizonEstimate
-from vehicle_detection.video import FrameSource, probe_video, read_frames
+from vehicle_detection.video import FrameSource
 
 
 def test_the_segments_of_a_card_become_one_video(material, tmp_path):

@@ -2,9 +2,7 @@ import numpy as np
 import pytest
 
 from tests.datasets.cases import patch_image
-from vehicle_detection.datasets import load_frames
-from vehicle_detection.errors import DatasetError
-from vehicle_detection.images import write_image
+from vehicle_detection import DatasetError, load_frames, write_image
 
 
 def test_frames_are_read_on_access(tmp_path):

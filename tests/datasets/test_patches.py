@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.datasets.cases import IN_ORDER, VEHICLES, make_set, patch_image, png, unpack, write_zip
+from vehicle_detection import DatasetError, InvalidInputError, write_image
 from vehicle_detection.datasets import PatchSet, archives, load_patches, load_training_patches
-from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.images import write_image
 
 # PatchSet
 

@@ -13,8 +13,8 @@ from tests.datasets.cases import (
     patch_image,
     set_of,
 )
+from vehicle_detection import InvalidInputError, PatchSet
 from vehicle_detection.datasets import (
-    PatchSet,
     Split,
     find_near_duplicates,
     split_groups,
@@ -23,7 +23,6 @@ from vehicle_detection.datasets import (
     split_sequences,
     split_sources,
 )
-from vehicle_detection.errors import InvalidInputError
 
 
 @given(st.lists(st.booleans(), min_size=20, max_size=100), fractions, st.integers(0, 2**32 - 1))

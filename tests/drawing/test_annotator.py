@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.drawing.cases import blank, changed_box, track
+from vehicle_detection import Camera, Detections, FrameResult, InvalidInputError
 from vehicle_detection.annotator import (
     LABEL_FIELDS,
     Annotator,
@@ -18,12 +19,8 @@ from vehicle_detection.annotator import (
     road_position,
     track_fields,
 )
-from vehicle_detection.boxes import Detections
-from vehicle_detection.camera import Camera
 from vehicle_detection.drawing import TRACK_COLORS, blur_boxes, color_index, track_color
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes import SceneVehicle, render_scene
-from vehicle_detection.tracking import FrameResult
 
 
 def test_labels_become_a_tuple():

@@ -8,16 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.drawing.cases import blank, changed_box
-from vehicle_detection.boxes import Detections
-from vehicle_detection.drawing import (
-    LabelPlacer,
-    LabelRequest,
-    blend,
-    blur_boxes,
-    draw_boxes,
-    draw_cell_shares,
-    draw_detections,
-)
+from vehicle_detection import Detections, blur_boxes, draw_boxes, draw_detections
+from vehicle_detection.drawing import LabelPlacer, LabelRequest, blend, draw_cell_shares
 
 BLUE = [0, 0, 255]
 

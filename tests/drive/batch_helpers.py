@@ -6,10 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from vehicle_detection import run_batch
+from vehicle_detection import probe_video, run_batch
 from vehicle_detection.drive.batch_store import open_store
 from vehicle_detection.drive.batch_trip import source_id
-from vehicle_detection.video import probe_video
 
 parquet = pytest.importorskip("pyarrow.parquet")
 

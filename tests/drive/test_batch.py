@@ -16,15 +16,13 @@ from typer.testing import CliRunner
 from tests.drive.batch_helpers import check_whole, counts, files, records, run
 from tests.helpers import FULL_DISK, failing, write_network
 from tests.video.clips import damage_sizes
-from vehicle_detection import process_video, run_batch
+from vehicle_detection import VehicleDetector, open_tracks, process_video, run_batch
 from vehicle_detection.cli.app import app
-from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drive import batch_status, batch_summary
 from vehicle_detection.drive import batch_store as store
 from vehicle_detection.drive import batch_trip as trip_module
 from vehicle_detection.drive.batch_trip import list_videos, source_id
 from vehicle_detection.errors import InvalidInputError, OutputError, TransientVideoError, VideoError
-from vehicle_detection.formats import open_tracks
 
 pytestmark = pytest.mark.usefixtures("private_scratch")
 

@@ -10,11 +10,10 @@ import pytest
 
 from tests.drive.batch_helpers import check_whole, counts, files, records, run
 from tests.helpers import answer, serve
-from vehicle_detection import run_batch
+from vehicle_detection import InvalidInputError, OutputError, run_batch
 from vehicle_detection.drive import batch_trip as plan
 from vehicle_detection.drive import batch_trip as trip
 from vehicle_detection.drive.batch_trip import list_videos
-from vehicle_detection.errors import InvalidInputError, OutputError
 
 pytestmark = pytest.mark.usefixtures("private_scratch")
 

@@ -5,10 +5,8 @@ import pytest
 
 from tests.drive.batch_helpers import check_whole, counts, run
 from tests.video.clips import write_clip
-from vehicle_detection import TrackTable, evaluate_tracks, read_labels
+from vehicle_detection import TrackTable, evaluate_tracks, probe_video, read_labels, render_drive
 from vehicle_detection.drive import find_trips
-from vehicle_detection.scenes import render_drive
-from vehicle_detection.video import probe_video
 
 pytestmark = pytest.mark.usefixtures("private_scratch")
 

@@ -18,9 +18,8 @@ from tests.drive.batch_helpers import check_whole, counts, files, records, run, 
 from tests.drive.conftest import TRIPS
 from tests.helpers import ROOT, wait_until
 from tests.video.clips import child_processes
-from vehicle_detection import run_batch
+from vehicle_detection import InvalidInputError, run_batch
 from vehicle_detection.drive import batch_status, open_dask
-from vehicle_detection.errors import InvalidInputError
 
 pytestmark = pytest.mark.usefixtures("private_scratch")
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from tests.video.clips import write_clip
-from vehicle_detection import probe_video, write_events
+from vehicle_detection import InvalidInputError, probe_video, write_events
 from vehicle_detection.drive import EVENT_COLUMNS, Event, cut_clips
-from vehicle_detection.errors import InvalidInputError
 
 EVENTS = [
     Event(kind="cut_in", track_id=2, frame=20, start_frame=12, end_frame=24, time_s=0.8, side="left",

@@ -11,11 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.drives import CAMERA, FPS, SHAPE, box_of, cut_in_times, log_frames, passing_times, simulate
-from vehicle_detection import Camera, Track, TrackTable, find_events
+from vehicle_detection import Camera, InvalidInputError, Track, TrackTable, find_events
 from vehicle_detection._common import UNITS
 from vehicle_detection.drive import Event
 from vehicle_detection.drive.motion import estimate_motion, track_histories
-from vehicle_detection.errors import InvalidInputError
 
 SEEDS = (0, 1, 2)
 simulated = functools.cache(simulate)

@@ -7,10 +7,9 @@ import pytest
 
 from tests.drive.report_helpers import FRAMES, StrictParser, video_report, write_report
 from tests.helpers import FULL_DISK
-from vehicle_detection.drive import ReportWriter
+from vehicle_detection import InvalidInputError, ReportWriter
 from vehicle_detection.drive import report as page
 from vehicle_detection.drive import report as writer
-from vehicle_detection.errors import InvalidInputError
 
 
 def test_a_large_video_is_linked(tmp_path):

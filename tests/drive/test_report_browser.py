@@ -12,14 +12,9 @@ from tests.drawing.cases import track
 from tests.drive.report_helpers import track as report_track
 from tests.drive.report_helpers import write_report
 from tools.browser import PHONE, Browser
-from vehicle_detection.annotator import Annotator
-from vehicle_detection.boxes import Detections
+from vehicle_detection import Annotator, Detections, FrameResult, VehicleDetector, process_video, render_drive
 from vehicle_detection.cli.demo import draw_clip
-from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drive import OwnSpeed, ReportWriter
-from vehicle_detection.scenes import render_drive
-from vehicle_detection.tracking import FrameResult
-from vehicle_detection.video import process_video
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="process groups and file names of POSIX")
 

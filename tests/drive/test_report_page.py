@@ -24,16 +24,11 @@ from tests.drive.report_helpers import (
     video_report,
     write_report,
 )
-from vehicle_detection.annotator import Annotator
-from vehicle_detection.camera import Camera
+from vehicle_detection import Annotator, Camera, InvalidInputError, TrackParams, TrackTable, load_classifier
 from vehicle_detection.detector import VehicleDetector, load_model
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.drive import Event, OwnSpeed, ReportWriter, TrackPicture
 from vehicle_detection.drive import report as page
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.svm import load_classifier
-from vehicle_detection.tables import TrackTable
-from vehicle_detection.tracking import TrackParams
 
 UNSAFE_NAME = "\"><img src=x onerror=alert(1)>&amp;'</title><script>.mp4"
 

@@ -4,9 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.evaluation.cases import CAR, boxes_of, moved, trials
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import best_f1, evaluate_detections, precision_recall_curve
-from vehicle_detection.tables import TrackTable
+from vehicle_detection import InvalidInputError, TrackTable, evaluate_detections
+from vehicle_detection.evaluation import best_f1, precision_recall_curve
 
 
 def test_counts_ratios_and_sizes_by_hand():

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from tests.cli.commands import run
+from vehicle_detection import TrackTable, read_labels
 from vehicle_detection.evaluation import evaluate_distances
-from vehicle_detection.formats import read_labels
-from vehicle_detection.tables import TrackTable
 
 BOXES = np.array([[10.0, 10, 60, 50], [100, 20, 140, 60], [200, 20, 240, 60]])
 

@@ -2,10 +2,7 @@ import numpy as np
 import pytest
 
 from tests.video.clips import write_clip
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import LabelledFrames
-from vehicle_detection.scenes import render_drive
-from vehicle_detection.tables import TrackTable
+from vehicle_detection import InvalidInputError, LabelledFrames, TrackTable, render_drive
 
 LABELS = TrackTable([0, 1, 1], None, [[10, 10, 60, 50], [20, 10, 70, 50], [100, 0, 150, 40]], frame_keys=[2])
 IMAGES = [np.full((60, 160, 3), value, np.uint8) for value in (10, 20)]

@@ -9,9 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.evaluation.cases import CAR, boxes_of, drives, moved, trials
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import evaluate_detections, evaluate_tracks
-from vehicle_detection.tables import TrackTable
+from vehicle_detection import InvalidInputError, TrackTable, evaluate_detections, evaluate_tracks
 
 IGNORED = np.array([True])
 

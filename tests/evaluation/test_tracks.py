@@ -7,10 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.evaluation.cases import CAR, boxes_of, moved, trials
-from vehicle_detection.boxes import iou_matrix
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import evaluate_tracks
-from vehicle_detection.tables import TrackTable
+from vehicle_detection import InvalidInputError, TrackTable, evaluate_tracks, iou_matrix
 
 
 def clip(tracks, *, step=4.0, offset=(0.0,)):

@@ -9,10 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.formats import read_labels
-from vehicle_detection.images import write_image
-from vehicle_detection.tables import TrackTable
+from vehicle_detection import DatasetError, InvalidInputError, TrackTable, read_labels, write_image
 
 HEADER = "frame,track,x1,y1,x2,y2,occluded,truncated,ignore"
 

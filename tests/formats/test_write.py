@@ -10,10 +10,8 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from tests.evaluation.cases import CAR, boxes_of, moved
-from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection import DatasetError, InvalidInputError, TrackTable, read_labels, write_labels
 from vehicle_detection.evaluation import evaluate_detections, precision_recall_curve
-from vehicle_detection.formats import read_labels, write_labels
-from vehicle_detection.tables import TrackTable
 
 corner = st.floats(-1e4, 1e4)
 side = st.floats(0.01, 1e4)  # a label has an area

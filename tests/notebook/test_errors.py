@@ -6,12 +6,7 @@ import pytest
 
 from tests.helpers import random_classifier
 from tests.notebook.helpers import SMALL, gray_image
-from vehicle_detection import notebook
-from vehicle_detection.boxes import Detections
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import LabelledFrames
-from vehicle_detection.tables import TrackTable
-from vehicle_detection.tracking import FrameResult
+from vehicle_detection import Detections, FrameResult, InvalidInputError, LabelledFrames, TrackTable, notebook
 
 IMAGE, NONE = gray_image(), Detections.empty()
 MODEL = random_classifier(SMALL)

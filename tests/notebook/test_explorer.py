@@ -6,17 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from vehicle_detection.boxes import iou_matrix
-from vehicle_detection.datasets import load_frames
+from vehicle_detection import Explorer, HeatParams, RegionParams, iou_matrix, load_frames, write_image
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.heatmap import HeatParams
-from vehicle_detection.images import write_image
 from vehicle_detection.network import NetworkParams
-from vehicle_detection.notebook import Explorer
 from vehicle_detection.notebook import explorer as module
 from vehicle_detection.notebook.explorer import METHODS, VIEWS
-from vehicle_detection.regions import RegionParams
 from vehicle_detection.scenes import render_scene
 from vehicle_detection.search import SearchParams
 

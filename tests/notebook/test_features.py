@@ -4,9 +4,8 @@ from skimage.feature import hog
 
 from tests.helpers import rendered_patches
 from tests.notebook.helpers import SMALL, titles
-from vehicle_detection import notebook
-from vehicle_detection.features import FeatureParams
-from vehicle_detection.svm import Template, VehicleClassifier
+from vehicle_detection import FeatureParams, VehicleClassifier, notebook
+from vehicle_detection.svm import Template
 
 
 def test_hog_has_a_panel_per_channel_and_cell_size():

@@ -2,10 +2,8 @@ import numpy as np
 import pytest
 
 from tests.notebook.helpers import drawn_boxes, gray_image, new_axes, texts
-from vehicle_detection import notebook
-from vehicle_detection.boxes import Detections
+from vehicle_detection import Detections, TrackTable, notebook
 from vehicle_detection.notebook.style import OTHER, SKY, TRUTH, VEHICLE
-from vehicle_detection.tables import TrackTable
 
 
 def test_images_have_titles_and_boxes():

@@ -3,12 +3,9 @@ import pandas as pd
 import pytest
 
 from tests.notebook.helpers import gray_image, legend, new_axes, texts
-from vehicle_detection import notebook
-from vehicle_detection.datasets import load_frames
+from vehicle_detection import TrackTable, load_frames, notebook, write_image
 from vehicle_detection.evaluation import LabelledFrames, evaluate_detections, precision_recall_curve
-from vehicle_detection.images import write_image
 from vehicle_detection.notebook.style import VERMILION
-from vehicle_detection.tables import TrackTable
 
 
 def labelled():

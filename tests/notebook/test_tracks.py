@@ -2,12 +2,8 @@ import numpy as np
 from matplotlib.colors import to_rgb
 
 from tests.notebook.helpers import texts
-from vehicle_detection import notebook
-from vehicle_detection.boxes import Detections
+from vehicle_detection import Detections, FrameResult, Track, TrackTable, notebook, render_drive
 from vehicle_detection.notebook.style import COLORS
-from vehicle_detection.scenes import render_drive
-from vehicle_detection.tables import TrackTable
-from vehicle_detection.tracking import FrameResult, Track
 
 
 def track(number, x, **changes):

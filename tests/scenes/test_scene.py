@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.helpers import ROOT, check_truth
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.images import read_image
-from vehicle_detection.scenes import SceneVehicle, render_scene
+from vehicle_detection import InvalidInputError, read_image, render_scene
+from vehicle_detection.scenes import SceneVehicle
 
 SMALL = (216, 384)
 TEST_IMAGES = ROOT / "test_images"

@@ -6,10 +6,7 @@ import pytest
 from tests.helpers import drawn, write_frame_set
 from tools import measure_model
 from tools.measure_model import choose_sources, measure
-from vehicle_detection import detector_from
-from vehicle_detection.errors import DatasetError
-from vehicle_detection.evaluation import LabelledFrames
-from vehicle_detection.tables import TrackTable
+from vehicle_detection import DatasetError, LabelledFrames, TrackTable, detector_from
 from vehicle_detection.training import FrameDataset
 
 VEHICLE = [10, 10, 60, 50]

@@ -5,9 +5,8 @@ pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
 
 from tests.helpers import drawn
 from tools.model_card import calibration_rows, write_card
-from vehicle_detection.evaluation import LabelledFrames
-from vehicle_detection.network import InputFormat, NetworkModel, OutputFormat
-from vehicle_detection.tables import TrackTable
+from vehicle_detection import LabelledFrames, NetworkModel, TrackTable
+from vehicle_detection.network import InputFormat, OutputFormat
 from vehicle_detection.training import FoldDetections, FrameDataset
 
 SOURCES = [FrameDataset("us_side", (drawn(range(3), "us_side"),)), FrameDataset("own", (drawn([4]),))]

@@ -8,8 +8,7 @@ import pytest
 from PIL import Image
 
 from tools import pictures
-from vehicle_detection import DetectorError, detector_from
-from vehicle_detection.scenes import render_drive
+from vehicle_detection import DetectorError, detector_from, render_drive
 
 DOCS = Path(__file__).parents[2] / "docs"
 RECORD = json.loads((DOCS / pictures.RECORD).read_text())

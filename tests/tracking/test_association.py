@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_detection.boxes import iou_matrix
-from vehicle_detection.tracking import TrackParams
+from vehicle_detection import TrackParams, iou_matrix
 from vehicle_detection.tracking.association import (
     center_distances,
     covered_fractions,

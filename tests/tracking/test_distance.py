@@ -3,8 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from vehicle_detection.boxes import Detections
-from vehicle_detection.camera import Camera
+from vehicle_detection import Camera, Detections, Tracker
 from vehicle_detection.tracking.distance import (
     estimate_distances,
     initiate_states,
@@ -12,7 +11,6 @@ from vehicle_detection.tracking.distance import (
     update_distances,
 )
 from vehicle_detection.tracking.kalman import Measurements, initiate
-from vehicle_detection.tracking.tracker import Tracker
 
 SHAPE = (720, 1280)
 CAMERA = Camera.for_frame(SHAPE, horizon_std_px=0.0)

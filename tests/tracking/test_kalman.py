@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from vehicle_detection.camera import Camera
-from vehicle_detection.tracking import TrackParams
+from vehicle_detection import Camera, TrackParams
 from vehicle_detection.tracking.distance import initiate_states
 from vehicle_detection.tracking.kalman import (
     UNKNOWN,

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from tests.helpers import ROOT
-from vehicle_detection.images import read_image
-from vehicle_detection.scenes import render_drive
+from vehicle_detection import read_image, render_drive
 from vehicle_detection.tracking import SceneCuts
 
 ROAD = read_image(ROOT / "test_images" / "road1.jpg")

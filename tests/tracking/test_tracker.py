@@ -7,11 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.evaluation.cases import boxes_of
+from vehicle_detection import Camera, InvalidInputError, evaluate_tracks, render_drive
 from vehicle_detection.boxes import Detections, Platt, iou_matrix
-from vehicle_detection.camera import Camera
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import evaluate_tracks
-from vehicle_detection.scenes import render_drive
 from vehicle_detection.tracking import Track, Tracker, TrackParams
 
 SHAPE = (720, 1280, 3)

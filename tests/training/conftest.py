@@ -3,11 +3,7 @@ import pytest
 
 from tests.helpers import random_classifier, rendered_patches
 from tests.training.trial_cases import SMALL
-from vehicle_detection.datasets import PatchSet
-from vehicle_detection.evaluation import LabelledFrames
-from vehicle_detection.features import FeatureParams
-from vehicle_detection.scenes import render_scene
-from vehicle_detection.tables import TrackTable
+from vehicle_detection import FeatureParams, LabelledFrames, PatchSet, TrackTable, render_scene
 
 
 @pytest.fixture(scope="package")

@@ -2,8 +2,7 @@ import shutil
 
 from benchmarks import _course_runs, course_tables
 from tests.training.trial_cases import SMALL, count_trials
-from vehicle_detection.features import FeatureParams
-from vehicle_detection.images import write_image
+from vehicle_detection import FeatureParams, write_image
 from vehicle_detection.training import read_results
 
 

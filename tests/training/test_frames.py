@@ -5,12 +5,8 @@ import pytest
 
 from tests.helpers import drawn, write_frame_set
 from tests.video.clips import gray_frames, write_clip
+from vehicle_detection import LabelledFrames, TrackTable, read_labels, render_drive, write_image, write_labels
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.evaluation import LabelledFrames
-from vehicle_detection.formats import read_labels, write_labels
-from vehicle_detection.images import write_image
-from vehicle_detection.scenes import render_drive
-from vehicle_detection.tables import TrackTable
 from vehicle_detection.training import FrameDataset, check_sources, find_sources, load_training_frames
 
 

@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 
 from tests.training.trial_cases import SEARCH
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.search import SearchBand, SearchParams
-from vehicle_detection.tables import TrackTable
+from vehicle_detection import InvalidInputError, SearchBand, SearchParams, TrackTable, find_cars
 from vehicle_detection.training import mine_negatives
-from vehicle_detection.windows import find_cars
 
 
 def boxes_of(mined):

@@ -5,24 +5,18 @@ import numpy as np
 import pytest
 
 from tests.helpers import rendered_patches
-from vehicle_detection.datasets import (
+from vehicle_detection import (
+    FeatureParams,
+    InvalidInputError,
     PatchSet,
-    load_training_patches,
-    split_leakage,
-    split_random,
-    split_sequences,
-    split_sources,
-)
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import FeatureParams
-from vehicle_detection.svm import load_classifier
-from vehicle_detection.training import (
-    SPLITS,
     TrainingOptions,
-    model_card,
+    load_classifier,
+    load_training_patches,
     train_and_evaluate,
     train_classifier,
 )
+from vehicle_detection.datasets import split_leakage, split_random, split_sequences, split_sources
+from vehicle_detection.training import SPLITS, model_card
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=6, pix_per_cell=16, hog_channel=0)
 SOURCES = {True: ("GTI_Far", "KITTI_extracted"), False: ("GTI", "Extras")}

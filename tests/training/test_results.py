@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection import DatasetError, InvalidInputError
 from vehicle_detection.training import (
     RowStore,
     make_table,

@@ -1,9 +1,7 @@
 import pytest
 
-from vehicle_detection import load_classifier
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import LabelledFrames
-from vehicle_detection.scenes import render_scene, truth_table
+from vehicle_detection import InvalidInputError, LabelledFrames, load_classifier, render_scene
+from vehicle_detection.scenes import truth_table
 from vehicle_detection.training import compare_searches
 
 

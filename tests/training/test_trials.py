@@ -2,12 +2,9 @@ import numpy as np
 import pytest
 
 from tests.training.trial_cases import SEARCH, SMALL, UNTIMED
+from vehicle_detection import FeatureParams, InvalidInputError, TrackTable, VehicleDetector
 from vehicle_detection.datasets import make_split, split_sequences
-from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, evaluate_detections
-from vehicle_detection.features import FeatureParams
-from vehicle_detection.tables import TrackTable
 from vehicle_detection.training import (
     FeatureCache,
     TrainingOptions,

@@ -1,10 +1,7 @@
 import numpy as np
 import pytest
 
-from vehicle_detection import detector_from
-from vehicle_detection.boxes import Detections
-from vehicle_detection.evaluation import LabelledFrames
-from vehicle_detection.tables import TrackTable
+from vehicle_detection import Detections, LabelledFrames, TrackTable, detector_from
 from vehicle_detection.training import (
     FOLD_COLUMNS,
     FoldDetections,

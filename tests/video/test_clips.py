@@ -17,10 +17,7 @@ from moviepy import (
 
 from tests.helpers import find_red
 from tests.video.clips import write_clip
-from vehicle_detection.annotator import Annotator, DrawParams
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.function_model import detector_from
-from vehicle_detection.scenes import render_drive
+from vehicle_detection import Annotator, DrawParams, InvalidInputError, detector_from, render_drive
 from vehicle_detection.video import annotate_clip, probe_video
 
 SHAPE = (120, 200)

@@ -7,8 +7,7 @@ import pytest
 
 from tests.helpers import StubDetector
 from tests.video.clips import damage_frames, damage_sizes, ffmpeg, gray_frames, write_clip
-from vehicle_detection.errors import VideoError
-from vehicle_detection.video import open_source, process_video, read_frames
+from vehicle_detection import VideoError, open_source, process_video, read_frames
 
 LOST = r"lost.mp4 is damaged: 17 of 20 frames cannot be decoded; copy or record it again"
 

@@ -9,10 +9,9 @@ import pytest
 
 from tests.helpers import random_network
 from tests.video.clips import ffmpeg
-from vehicle_detection import VehicleDetector, open_tracks, process_video, track, write_video
+from vehicle_detection import VehicleDetector, open_tracks, process_video, render_drive, track, write_video
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.scenes import render_drive
 from vehicle_detection.video import open_source, read_frames
 
 

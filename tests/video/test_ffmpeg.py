@@ -15,8 +15,7 @@ from imageio_ffmpeg import get_ffmpeg_exe
 
 from tests.helpers import ROOT, StubDetector, failing, start_interruptible, wait_until
 from tests.video.clips import NTSC, child_processes, ffmpeg, ffmpeg_log, gray_frames, write_clip
-from vehicle_detection.errors import TransientVideoError, VideoError
-from vehicle_detection.video import probe_video, process_video, read_frames
+from vehicle_detection import TransientVideoError, VideoError, probe_video, process_video, read_frames
 from vehicle_detection.video.ffmpeg import Process, check_resources, exit_reason, ffmpeg_binary
 from vehicle_detection.video.probe import frame_rate
 

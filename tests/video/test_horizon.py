@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 
 from tests.helpers import boxes_on_a_road
-from vehicle_detection.boxes import Detections
-from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video import estimate_video_horizon, open_source
+from vehicle_detection import Detections, InvalidInputError, VehicleDetector, open_source
+from vehicle_detection.video import estimate_video_horizon
 
 
 class StubImageDetector:

@@ -7,8 +7,7 @@ import threading
 import pytest
 
 from tests.video.clips import gray_frames, write_clip
-from vehicle_detection.errors import VehicleDetectionError
-from vehicle_detection.video import open_source
+from vehicle_detection import VehicleDetectionError, open_source
 
 MANIFESTS = {
     "DASH": """<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011" type="static"

@@ -25,8 +25,7 @@ from tests.video.clips import (
     running_threads,
     write_clip,
 )
-from vehicle_detection.boxes import Detections
-from vehicle_detection.errors import InvalidInputError, VideoError
+from vehicle_detection import Detections, InvalidInputError, VideoError
 from vehicle_detection.tracking import FrameResult, Track, TrackParams, interpolate_results
 from vehicle_detection.video import (
     Encoding,

@@ -26,9 +26,8 @@ from tests.video.clips import (
     write_beep,
     write_clip,
 )
+from vehicle_detection import InvalidInputError, TransientVideoError, VideoError, write_image
 from vehicle_detection._common import web
-from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
-from vehicle_detection.images import write_image
 from vehicle_detection.video import ffmpeg as ffmpeg_module
 from vehicle_detection.video import (
     live,

@@ -21,8 +21,7 @@ from tests.video.clips import (
     write_beep,
     write_clip,
 )
-from vehicle_detection.errors import VideoError
-from vehicle_detection.video import open_source, probe_video, process_video, read_frames
+from vehicle_detection import VideoError, open_source, probe_video, process_video, read_frames
 
 
 @pytest.fixture(scope="module")

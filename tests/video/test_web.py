@@ -8,11 +8,10 @@ import pytest
 
 from tests.helpers import answer, serve
 from tests.video.clips import gray_frames, write_clip
-from vehicle_detection import read_image
+from vehicle_detection import InvalidInputError, TransientVideoError, VideoError, open_source, read_image
 from vehicle_detection._common import web
-from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.video import ffmpeg as ffmpeg_module
-from vehicle_detection.video import open_source, remote
+from vehicle_detection.video import remote
 
 DASH = """<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011" type="static"
     mediaPresentationDuration="PT1S"><Period><AdaptationSet mimeType="video/mp4"><Representation id="1"

@@ -14,17 +14,15 @@ from moviepy.config import FFMPEG_BINARY
 
 from tests.helpers import StubDetector
 from tests.video.clips import NTSC, ffmpeg, ffmpeg_log, frame_numbers
-from vehicle_detection.errors import InvalidInputError, TransientVideoError
-from vehicle_detection.video import (
-    Encoding,
-    VideoReport,
-    encoding,
-    engine,
+from vehicle_detection import (
+    InvalidInputError,
+    TransientVideoError,
     open_source,
     probe_video,
     process_video,
     read_frames,
 )
+from vehicle_detection.video import Encoding, VideoReport, encoding, engine
 
 
 def test_a_complete_video_keeps_frames_rate_and_sound(clip, tmp_path):
