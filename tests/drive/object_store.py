@@ -76,7 +76,7 @@ class LoopbackFileSystem(AbstractFileSystem):
             raise FileNotFoundError(path)
         return list(entries.values()) if detail else list(entries)
 
-    def cat_file(self, path, **_):
+    def cat_file(self, path, *_, **__):
         return self._ask("read", path)[1].read_bytes()
 
     def get_file(self, path, target, **_):

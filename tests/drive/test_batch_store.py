@@ -107,7 +107,8 @@ def test_a_killed_batch_with_workers_and_an_object_store(many, model, tmp_path, 
 def test_a_store_is_the_same_for_a_folder_and_a_url(tmp_path, bucket):
     file = tmp_path / "file"
     file.write_bytes(b"whole")
-    for out in (tmp_path / "out", (tmp_path / "o u t").as_uri(), "memory://store/a", "loopback://store/a"):
+    remote = "memory://store/a[1]", "loopback://store/a"
+    for out in (tmp_path / "out", (tmp_path / "o u t").as_uri(), *remote):
         opened = open_store(out, create=True)
         assert not opened.exists("tracks/x")
         assert opened.read("tracks/x") is None

@@ -146,13 +146,14 @@ class Store:
 
     def read_many(self, paths: Iterable[str]) -> Iterator[tuple[str, bytes]]:
         """Yield paths and contents of files that exist; many storages read them in parallel."""
-        found: dict[str, Any] = {}
-        wanted = {path if self._folder else self._path(path): path for path in paths}
+        wanted = list(paths)
+        found: list[Any] = [None] * len(wanted)
         if wanted and not self._folder:
-            read_all = functools.partial(self._filesystem.cat, [*wanted], on_error="return")
+            # Not by `cat`, which would expand a path with brackets as a pattern.
+            places = [self._path(path) for path in wanted]
+            read_all = functools.partial(self._filesystem.cat_ranges, places, None, None)
             found = self._request(" cannot be read", read_all)
-        for place, path in wanted.items():
-            data = found.get(place)
+        for path, data in zip(wanted, found):
             if not isinstance(data, bytes):  # a local file, or one of many that has failed
                 data = self.read(path)
             if data is not None:
