@@ -3,6 +3,7 @@
 import os
 import sys
 import types
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -65,50 +66,27 @@ def test_without_a_display_or_tkinter(clip, monkeypatch):
 
 
 def test_a_window_scales_large_frames_down_and_can_be_closed(monkeypatch):
-    shown, bound = [], {}
-
-    class Widget:
-        def __init__(self, *_):
-            pass
-
-        def protocol(self, name, function):
-            bound[name] = function
-
-        def bind(self, key, function):
-            bound[key] = function
-
-        def winfo_screenwidth(self):
-            return 1000
-
-        def winfo_screenheight(self):
-            return 500
-
-        def title(self, text):
-            bound["title"] = text
-
-        def configure(self, image):
-            shown.append(image)
-
-        def pack(self):
-            pass
-
-        update = destroy = pack
-
-    fake = types.SimpleNamespace(Tk=Widget, Label=Widget, TclError=RuntimeError, PhotoImage=lambda data: data)
-    monkeypatch.setitem(sys.modules, "tkinter", fake)
+    tkinter = MagicMock(TclError=RuntimeError, PhotoImage=lambda data: data)
+    root, label = tkinter.Tk(), tkinter.Label()
+    root.winfo_screenwidth.return_value, root.winfo_screenheight.return_value = 1000, 500
+    monkeypatch.setitem(sys.modules, "tkinter", tkinter)
     monkeypatch.setattr(viewer.WindowViewer, "_interval", 0)
     monkeypatch.setitem(sys.modules, "IPython", None)
     window = viewer.open_viewer("drive.mp4")
     window.show(np.full((100, 200, 3), 7, np.uint8))
     window.show(np.zeros((900, 1000, 3), np.uint8))
-    assert bound["title"] == "drive.mp4"
+    root.title.assert_called_with("drive.mp4")
+    shown = [call.kwargs["image"] for call in label.configure.call_args_list]
     assert shown[0] == b"P6 200 100 255 " + b"\7" * 60_000
     assert shown[1].startswith(b"P6 500 450 255 ")
-    bound["<Escape>"](None)
+    key, close = root.bind.call_args.args
+    assert key == "<Escape>"
+    close(None)
     assert window.closed
     window.show(np.zeros((9, 9, 3), np.uint8))
     window.close()
-    assert len(shown) == 2
+    assert len(label.configure.call_args_list) == 2
+    root.destroy.assert_called_once()
 
 
 def test_a_notebook_shows_one_picture_that_changes(monkeypatch):

@@ -291,20 +291,18 @@ def _plan(
     for key in store.record_keys():
         earlier.setdefault(identity_of(key), []).append(key)
     number, count = part
-    tasks = []
     mine = [trip for trip in trips if int(source_id(str(trip.files[0])), 16) % count == number - 1]
     with ThreadPoolExecutor(_LOOKUPS, thread_name_prefix="vehicle-plan") as pool:
         plans = list(pool.map(lambda trip: plan_trip(trip, listed, settings, fingerprint), mine))
     longer = _longer_records(plans, earlier, store)
+    tasks = []
     for trip, plan in zip(mine, plans, strict=True):
-        trip, plan = _without_recorded(trip, plan, longer.get(plan["sources"][0]["uri"]), listed)
-        task = plan | {"out": store.name}
+        plan = _without_recorded(trip, plan, longer.get(plan["sources"][0]["uri"]), listed)
         # A trip replaces the earlier ones that began with one of its files.
-        ids = (source_id(str(file)) for file in trip.files)
-        keys = [key for each in ids for key in earlier.get(each, ())]
-        task["recorded"] = task["key"] in earlier.get(identity_of(task["key"]), ())
-        task["replaces"] = [key for key in keys if key != task["key"]]
-        tasks.append(task)
+        keys = [key for file in plan["files"] for key in earlier.get(source_id(file), ())]
+        known = plan["key"] in earlier.get(identity_of(plan["key"]), ())
+        replaced = [key for key in keys if key != plan["key"]]
+        tasks.append(plan | {"out": store.name, "recorded": known, "replaces": replaced})
     return tasks
 
 
@@ -340,20 +338,20 @@ def _longer_records(
 
 def _without_recorded(
     trip: Trip, plan: dict[str, Any], record: Mapping[str, Any] | None, listed: Mapping[str, Facts]
-) -> tuple[Trip, dict[str, Any]]:
+) -> dict[str, Any]:
     """Leave out the first files of a trip that a longer record holds, if it has the same parameters."""
     settings, fingerprint = plan["settings"], plan["fingerprint"]
     if record is None or record["key"].partition("-")[2] != trip_digest(
         record["sources"], settings, fingerprint
     ):
-        return trip, plan
+        return plan
     held = sum(1 for _ in takewhile(record["sources"].__contains__, plan["sources"]))
     if held == len(trip.files):
         # All of it is held: with that key, `_pending` skips the trip.
-        return trip, plan | {"key": record["key"]}
+        return plan | {"key": record["key"]}
     start = find_trips([trip.files[held]])[0].start  # of the first file that is left
     rest = replace(trip, files=trip.files[held:], start=start)
-    return rest, plan_trip(rest, listed, settings, fingerprint)
+    return plan_trip(rest, listed, settings, fingerprint)
 
 
 def _pending(

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import importlib
+import io
 import time
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from vehicle_detection._common import in_notebook
 from vehicle_detection.errors import InvalidInputError
 
-# Largest width in a notebook, which stores and sends each picture.
-_NOTEBOOK_WIDTH = 960
+# Largest width in a notebook, which stores and sends each picture, and quality of the pictures (JPEG).
+_NOTEBOOK_WIDTH, _QUALITY = 960, 95
 # Fraction of the screen that a window may take.
 _SCREEN_FRACTION = 0.9
 
@@ -33,9 +34,11 @@ class Viewer:
         now = time.monotonic()
         if not self.closed and now - self._last >= self._interval:
             self._last = now
-            self._show(_fit(frame, *self._size))
+            picture = Image.fromarray(frame)
+            picture.thumbnail(self._size)
+            self._show(picture)
 
-    def _show(self, frame: NDArray[np.uint8]) -> None:
+    def _show(self, picture: Image.Image) -> None:
         raise NotImplementedError
 
     def close(self) -> None:
@@ -75,11 +78,10 @@ class WindowViewer(Viewer):
         width, height = self._root.winfo_screenwidth(), self._root.winfo_screenheight()
         self._size = int(width * _SCREEN_FRACTION), int(height * _SCREEN_FRACTION)
 
-    def _show(self, frame: NDArray[np.uint8]) -> None:
-        """Show a frame, and process the window's events."""
-        height, width = frame.shape[:2]
+    def _show(self, picture: Image.Image) -> None:
+        """Show a picture, and process the window's events."""
         # The label keeps no reference.
-        self._picture = self._tkinter.PhotoImage(data=b"P6 %d %d 255 " % (width, height) + frame.tobytes())
+        self._picture = self._tkinter.PhotoImage(data=b"P6 %d %d 255 " % picture.size + picture.tobytes())
         self._label.configure(image=self._picture)
         self._root.update()
 
@@ -100,19 +102,11 @@ class NotebookViewer(Viewer):
         self._display: Any = importlib.import_module("IPython.display")
         self._handle: Any = None
 
-    def _show(self, frame: NDArray[np.uint8]) -> None:
-        _, data = cv2.imencode(".jpg", np.ascontiguousarray(frame[..., ::-1]))
-        picture = self._display.Image(data=data.tobytes(), format="jpeg")
+    def _show(self, picture: Image.Image) -> None:
+        data = io.BytesIO()
+        picture.save(data, "jpeg", quality=_QUALITY)
+        shown = self._display.Image(data=data.getvalue(), format="jpeg")
         if self._handle is None:
-            self._handle = self._display.display(picture, display_id=True)
+            self._handle = self._display.display(shown, display_id=True)
         else:
-            self._handle.update(picture)
-
-
-def _fit(frame: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """Scale a frame down to a size."""
-    scale = min(width / frame.shape[1], height / frame.shape[0])
-    if scale >= 1:
-        return frame
-    size = max(1, round(frame.shape[1] * scale)), max(1, round(frame.shape[0] * scale))
-    return np.asarray(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), np.uint8)
+            self._handle.update(shown)
