@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check
-from vehicle_detection.datasets import PatchSet
+from vehicle_detection.datasets import PatchSet, check_labels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.notebook import style
 from vehicle_detection.notebook.style import OTHER, SKY, TRUTH, VEHICLE, Boxes, FigureLike, Image
@@ -88,19 +88,19 @@ def plot_patches(
         captions = patches.sources.tolist() if captions is None else captions
     else:
         images = style.check_list(patches, "patches", "images")
-    classes = style.check_numbers(labels, "labels", len(images), "patches")
+    classes = None if labels is None else check_labels(labels, count=len(images))
     texts = style.check_length(captions, "captions", len(images), "patches")
-    values = style.check_numbers(scores, "scores", len(images), "patches")
+    values = style.check_length(scores, "scores", len(images), "patches")
     shown = min(len(images), check.integer(count, "count", low=1, high=1000))
     rows = np.linspace(0, len(images) - 1, shown).round().astype(np.intp).tolist()
     if not rows:
         raise InvalidInputError("patches must hold at least one patch; got none")
     tiles = []
     for row in rows:
-        score = "" if values is None else f"score {values[row]:+.2f}"
+        score = "" if scores is None else f"score {check.number(values[row], 'scores'):+.2f}"
         caption = "\n".join(filter(None, (texts[row], score)))
         tiles.append((style.check_displayable(images[row], f"patches[{row}]"), caption))
-    lines = any(texts[row] for row in rows) + (values is not None)
+    lines = any(texts[row] for row in rows) + (scores is not None)
     colors = None if classes is None else [VEHICLE if classes[row] else OTHER for row in rows]
     axes, _ = style.add_tiles(ax, tiles, columns=columns, inches=1.25, caption_lines=lines, colors=colors)
     if colors:

@@ -123,7 +123,7 @@ def check_list(values: object, name: str, kind: str) -> list[Any]:
     return listed
 
 
-def check_length(values: Sequence[object] | None, name: str, count: int, entries: str) -> list[Any]:
+def check_length(values: object, name: str, count: int, entries: str) -> list[Any]:
     """Return `values` as a list of `count` entries; None stands for `count` times None."""
     if values is None:
         return [None] * count
@@ -133,18 +133,6 @@ def check_length(values: Sequence[object] | None, name: str, count: int, entries
             f"{name} must have one value for each of the {count} {entries}, got {len(listed)}"
         )
     return listed
-
-
-def check_numbers(values: ArrayLike | None, name: str, count: int, entries: str) -> NDArray[Any] | None:
-    """Return `values` as an array with one number for each of `count` entries; None stays None."""
-    if values is None:
-        return None
-    array = check.array(values, name)
-    if array.shape != (count,) or array.dtype.kind not in "biuf":
-        raise InvalidInputError(
-            f"{name} must be one number for each of {count} {entries}; got {describe(array)}"
-        )
-    return array
 
 
 def split_titles(images: object, titles: Sequence[str] | None = None) -> tuple[list[Any], list[Any]]:

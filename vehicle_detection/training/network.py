@@ -7,7 +7,7 @@ import copy
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,56 +79,38 @@ def train_network(
     report = on_step or (lambda _, line: log.info(line))
     centers, _ = cell_centers(training.size[1], training.size[0], place)
     sampler = Sampler(frames, training.size, place)
-    first, start, report_is_due = state.step, time.monotonic(), _timer(_REPORT_SECONDS)
-    checkpoint_is_due = _timer(_CHECKPOINT_SECONDS)
-    with _torch_settings(jobs):
+    first, start = state.step, time.monotonic()
+    reported = saved = start
+    cudnn = torch.backends.cudnn
+    with contextlib.ExitStack() as stack:
+        stack.callback(torch.set_num_threads, torch.get_num_threads())
+        torch.set_num_threads(jobs)
+        # On CUDA, algorithms that add in the same order each time.
+        stack.callback(setattr, cudnn, "deterministic", cudnn.deterministic)
+        cudnn.deterministic = True
         while state.step < training.steps:
             images, targets = sampler.draw(
                 np.random.default_rng([training.random_state, state.step]), training.batch
             )
             losses = state.update(images, targets, centers)
-            if report_is_due() or state.step == training.steps:
+            now = time.monotonic()
+            if now - reported >= _REPORT_SECONDS or state.step == training.steps:
+                reported = now
                 score, box = (each.item() for each in losses)
-                passed = time.monotonic() - start
+                passed = now - start
                 left = passed / (state.step - first) * (training.steps - state.step)
                 times = f"{_minutes(passed)} min, {_minutes(left)} min left"
                 progress = f"step {state.step} of {training.steps}"
                 report(state.step, f"{progress}: {times}, losses {score:.3f} + {box:.3f}")
-            if checkpoint is not None and checkpoint_is_due():
+            if checkpoint is not None and now - saved >= _CHECKPOINT_SECONDS:
+                saved = now
                 state.save(checkpoint)
     average: Network = state.average.cpu().eval()
     return average
 
 
-def _timer(seconds: float) -> Callable[[], bool]:
-    """Return a function that tells whether so many seconds have passed since it last said so."""
-    last = time.monotonic()
-
-    def is_due() -> bool:
-        nonlocal last
-        due = time.monotonic() - last >= seconds
-        last = time.monotonic() if due else last
-        return due
-
-    return is_due
-
-
 def _minutes(seconds: float) -> str:
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
-
-
-@contextlib.contextmanager
-def _torch_settings(threads: int) -> Iterator[None]:
-    """Compute with some threads, and on CUDA with algorithms that add in the same order each time."""
-    cudnn = torch.backends.cudnn
-    before = torch.get_num_threads(), cudnn.deterministic
-    torch.set_num_threads(threads)
-    cudnn.deterministic = True
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before[0])
-        cudnn.deterministic = before[1]
 
 
 class _State:

@@ -72,13 +72,6 @@ class TrainingReport:
     `seconds`: work time per step; concurrent fits are summed, so the total may exceed the elapsed time.
     `calibration_error`: on the test part of ``"sequences"``, with the sigmoid fitted on a second such split
     of the training part; None if that split is impossible.
-
-    >>> from vehicle_detection import render_patches
-    >>> patches, labels = render_patches(20)
-    >>> names = [f"{'vehicles' if label else 'others'}/drawn/{n}.png" for n, label in enumerate(labels)]
-    >>> _, report = train_and_evaluate(PatchSet(patches, labels, names), params=FeatureParams(hog_channel=0))
-    >>> report.split, report.vehicles, report.sources
-    ('random', 10, {'drawn': 20})
     """
 
     params: FeatureParams

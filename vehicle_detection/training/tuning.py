@@ -209,11 +209,12 @@ def halve_configurations(
     All are ranked on few patches of a split, the best third continues with three times as many, and so on
     (scikit-learn's ``HalvingGridSearchCV``). Impossible ones are left out.
     """
-    from sklearn.base import BaseEstimator, ClassifierMixin
+    import pandas as pd
+    from sklearn.base import BaseEstimator
     from sklearn.experimental import enable_halving_search_cv  # noqa: F401 - enables the next import
     from sklearn.model_selection import HalvingGridSearchCV
 
-    class Trial(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+    class Trial(BaseEstimator):  # type: ignore[misc]
         """A candidate as an estimator of patches."""
 
         def __init__(self, candidate: Any = None) -> None:
@@ -221,7 +222,6 @@ def halve_configurations(
 
         def fit(self, X: NDArray[np.uint8], y: NDArray[np.int64]) -> Trial:
             options = dataclasses.replace(self.candidate.training, random_state=random_state)
-            self.classes_ = np.unique(y)
             self.model_ = train_classifier(X, y, params=self.candidate.params, options=options)
             return self
 
@@ -242,10 +242,9 @@ def halve_configurations(
         refit=False,
         random_state=random_state,
     )
-    results = search.fit(patch_set.patches, patch_set.labels.astype(np.int64)).cv_results_
-    order = np.lexsort((-results["mean_test_score"], -results["iter"]))
-    best = dict.fromkeys(results["params"][row]["candidate"] for row in order)
-    return [each.options for each in best][:count]
+    results = pd.DataFrame(search.fit(patch_set.patches, patch_set.labels.astype(np.int64)).cv_results_)
+    results = results.sort_values(["iter", "mean_test_score"], ascending=False)
+    return [each.options for each in results["param_candidate"].drop_duplicates()[:count]]
 
 
 def expand_grid(grid: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
