@@ -12,7 +12,7 @@ from PIL import Image
 
 from tests.helpers import FULL_DISK
 from vehicle_detection.errors import InvalidInputError, OutputError
-from vehicle_detection.images import decode_image, image_size, read_image, write_image
+from vehicle_detection.images import decode_image, image_array, image_size, read_image, write_image
 
 
 @pytest.fixture(scope="module")
@@ -191,6 +191,35 @@ def test_a_file_without_an_image_is_refused(tmp_path, content):
     file.write_bytes(content)
     with pytest.raises(InvalidInputError, match=r"a.png must be a complete image file"):
         read_image(file)
+
+
+@pytest.mark.parametrize(
+    ("begin", "reason"),
+    [
+        (b"", "it is empty"),
+        (b"\0\0\0\x20ftypavif", "it is AVIF, convert it to PNG or JPEG"),
+        (b"\0\0\0\x20ftypisom", "it is a video, which vehicle_detection.track reads"),
+        (b"RIFF\0\0\0\0AVI LIST", "it is a video"),
+        (b"\x1aE\xdf\xa3", "it is a video"),
+        (b"G" + bytes(187) + b"G", "it is a video"),
+    ],
+)
+def test_files_of_other_kinds_are_named(begin, reason):
+    with pytest.raises(InvalidInputError, match=reason):
+        read_image(begin)
+
+
+def test_images_of_pillow_with_16_bits_become_8_bits(picture):
+    gray = np.ascontiguousarray(picture[..., 0])
+    deep = Image.fromarray(gray.astype(np.uint16) * 257)
+    assert deep.mode == "I;16"
+    np.testing.assert_array_equal(image_array(deep), np.stack([gray] * 3, axis=2))
+
+
+@pytest.mark.parametrize("mode", ["I", "F"])
+def test_images_of_pillow_with_an_unknown_range_are_refused(mode):
+    with pytest.raises(InvalidInputError, match=f"range of values that is known, .* mode {mode}; scale"):
+        image_array(Image.new(mode, (64, 64)))
 
 
 def test_a_failed_write_keeps_the_earlier_file(tmp_path, picture, monkeypatch):

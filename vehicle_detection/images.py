@@ -43,6 +43,12 @@ _HEADERS = {
     rb"P[1-6][\s#]": "PpmImagePlugin.PpmImageFile",
     rb"\0\0\0\x0cjP  |\xff\x4f\xff\x51": "Jpeg2KImagePlugin.Jpeg2KImageFile",
 }
+# Why a file is no image, by how it begins.
+_NOT_READ = {
+    rb"\Z": "it is empty",
+    rb".{4}ftypavi[fs]": "it is AVIF, convert it to PNG or JPEG",
+    rb".{4}ftyp|RIFF.{4}AVI |\x1aE\xdf\xa3|G.{187}G": "it is a video, which vehicle_detection.track reads",
+}
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
@@ -106,9 +112,9 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
     with contextlib.suppress(cv2.error, MemoryError):
         image = None if size is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
     if image is None or _is_truncated(data):
-        raise InvalidInputError(
-            f"{name} must be a complete image file (PNG, JPEG, ...); it cannot be decoded"
-        )
+        reasons = (reason for magic, reason in _NOT_READ.items() if re.match(magic, data, re.DOTALL))
+        reason = next(reasons, "it cannot be decoded")
+        raise InvalidInputError(f"{name} must be a complete image file (PNG, JPEG, ...); {reason}")
     return np.asarray(image, np.uint8)
 
 
@@ -173,10 +179,24 @@ def image_array(image: Any) -> NDArray[np.uint8]:
     if isinstance(image, (str, os.PathLike, bytes)):
         return read_image(image)
     if hasattr(image, "mode") and hasattr(image, "convert"):
-        from PIL.ImageOps import exif_transpose
-
-        return np.array(exif_transpose(image).convert("RGB"), np.uint8)
+        return _from_pillow(image)
     return check.image(image)
+
+
+def _from_pillow(image: Any) -> NDArray[np.uint8]:
+    """Convert an image of Pillow, which itself cuts the values of 16 bits off at 255."""
+    from PIL.ImageOps import exif_transpose
+
+    upright = exif_transpose(image)
+    if upright.mode in ("I", "F"):
+        raise InvalidInputError(
+            f"image must have a range of values that is known, got one of Pillow with mode {upright.mode}; "
+            "scale its values to 0-255 and convert it to RGB"
+        )
+    if upright.mode.startswith("I;16"):
+        gray = (np.asarray(upright, np.uint16) // 257).astype(np.uint8)
+        return np.repeat(gray[:, :, None], 3, axis=2)
+    return np.array(upright.convert("RGB"), np.uint8)
 
 
 def list_images(source: Any) -> Sequence[Any] | None:

@@ -68,6 +68,7 @@ def test_arrays_that_fit_are_returned():
     [
         ("road.png", "read files with vehicle_detection.read_image"),
         ([[1, 2, 3]], "pass one image after the other"),
+        (iter([IMAGE]), "pass a list of images"),
         (SimpleNamespace(convert=None), r"numpy\.asarray\(image\.convert\('RGB'\)\)"),
         (memoryview(IMAGE), "read files with vehicle_detection.read_image"),
         (np.zeros((3, 4, 6), np.uint8), r"image\.transpose\(1, 2, 0\)"),

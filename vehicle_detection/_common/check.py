@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from numbers import Real
 from pathlib import Path
 from typing import Any, TypeGuard, get_args
@@ -88,6 +88,8 @@ def image(value: object, name: str = "image") -> NDArray[np.uint8]:
             remedy = "convert it with numpy.asarray(image)"
         elif isinstance(value, (list, tuple)):
             remedy = "pass one image after the other"
+        elif isinstance(value, (Iterator, Mapping)):
+            remedy = "pass a list of images"
         elif isinstance(value, bytes):
             remedy = "decode it with vehicle_detection.read_image(data)"
         raise invalid(name, "be an (H, W, 3) uint8 RGB array", value, remedy)

@@ -180,9 +180,10 @@ def _open(source: object, options: _Options) -> FrameSource:
     """Open a source that is not yet open."""
     if isinstance(source, int) and not isinstance(source, bool):
         source = str(source)
-    if isinstance(source, (list, tuple)):
+    is_path = (str, os.PathLike)
+    if isinstance(source, (list, tuple)) and all(isinstance(each, is_path) for each in source):
         return _open_files([check_file(path) for path in source], options)
-    if not isinstance(source, (str, os.PathLike)):
+    if not isinstance(source, is_path):
         raise InvalidInputError(
             f"source must be the path of a video file, a folder, a pattern, a list of files, a URL, '-' or a "
             f"camera's number, got {describe(source)}; pass a file name, or call detector.process(frame, "
