@@ -9,7 +9,6 @@ from tests.drive.report_helpers import FRAMES, StrictParser, video_report, write
 from tests.helpers import FULL_DISK
 from vehicle_detection import InvalidInputError, ReportWriter
 from vehicle_detection.drive import report as page
-from vehicle_detection.drive import report as writer
 
 
 def test_a_large_video_is_linked(tmp_path):
@@ -42,12 +41,12 @@ def test_no_piece_of_a_page_holds_the_whole_video(tmp_path, monkeypatch):
     monkeypatch.setattr(page, "_CHUNK", 3000)
     video = tmp_path / "video.mp4"
     video.write_bytes(bytes(90_000))
-    sizes, render = [], writer.render_page
+    sizes, render = [], ReportWriter._render
 
     def watch(*args, **options):
         return (sizes.append(len(piece)) or piece for piece in render(*args, **options))
 
-    monkeypatch.setattr(writer, "render_page", watch)
+    monkeypatch.setattr(ReportWriter, "_render", watch)
     write_report(tmp_path, FRAMES, video=video)
     assert sizes.count(4000) >= 30
     assert max(sizes) < 20_000

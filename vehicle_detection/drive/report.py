@@ -143,11 +143,11 @@ class ReportWriter:
             if os.path.realpath(value) == os.path.realpath(self._path):
                 raise InvalidInputError(f"path {self._path} is also the {name}; choose another name")
         self._video = None if video is None else Path(video)
-        self._source = None if source is None else Path(hide_credentials(os.fspath(source))).name
-        self._source_path = None
+        self._source_path = self._source = None
         if source is not None:
-            is_path = not is_url(os.fspath(source))
-            self._source_path = str(Path(source)) if is_path else hide_credentials(os.fspath(source))
+            text = os.fspath(source)
+            self._source_path = hide_credentials(text) if is_url(text) else str(Path(text))
+            self._source = Path(hide_credentials(text)).name
         self._detector, self._units = detector, units
         self._embed_limit = check.integer(embed_limit, "embed_limit", low=0)
         self.table = TrackTable()  # of the frames that were added
@@ -178,7 +178,7 @@ class ReportWriter:
         speeds = None if own is None else own_speeds(own, self.table, fps=fps)
         if events is None:
             camera = getattr(self._detector, "camera", None)
-            camera = camera.for_shape(report.shape) if isinstance(camera, Camera) else None
+            camera = camera if isinstance(camera, Camera) else None
             events = find_events(self.table, fps=fps, shape=report.shape, camera=camera, own_speed_mps=speeds)
         listed = check.sequence(pictures, "pictures", "TrackPicture")
         for picture in listed:
@@ -186,23 +186,71 @@ class ReportWriter:
         if self._source_path and self._source:  # without its folder, as in the title
             damage = report.damage.replace(self._source_path, self._source)
             report = dataclasses.replace(report, damage=damage)
-        pieces = render_page(
-            self.table,
-            report,
-            events=check_events(events),
-            video=self._embed(),
-            source=self._source,
-            detector=self._detector,
-            units=self._units,
-            pictures=listed,
-            own_speed_mps=speeds,
-        )
+        pieces = self._render(report, check_events(events), listed, speeds)
         with (
             atomic_write(self._path, "path") as part,
             # A file name may hold bytes that are not UTF-8; they become question marks.
             part.open("w", encoding="utf-8", errors="replace", newline="\n") as file,
         ):
             file.writelines(pieces)
+
+    def _render(
+        self,
+        report: VideoReport,
+        events: Sequence[Event],
+        pictures: Sequence[TrackPicture],
+        own_speed_mps: Floats | None,
+    ) -> Iterator[str]:
+        """Render the page in pieces; the detector may lack settings or a model, which are then left out.
+
+        `own_speed_mps` is the camera's speed over ground in each frame of the table, if it is known.
+        """
+        from jinja2 import Environment, StrictUndefined
+
+        table, detector, units = self.table, self._detector, UNITS[self._units]
+        axis = TimeAxis(max(report.frames, len(table.counts()), 1), float(report.fps))
+        own = None if own_speed_mps is None else own_speed_mps * units.speed
+        tracks = [_for_page(track, units, own) for track in track_histories(table)]
+        bars, seconds = _count_bars(table, axis)
+        data = _script_data(tracks, axis, own)
+        data |= {"units": [units.distance_symbol, units.speed_symbol], "counts": bars}
+        quantities = ("distance", *["speed over ground"] * (own is not None), "relative speed")
+        figures = [_count_figure(bars, seconds), *(_curve_figure(each, data, units) for each in quantities)]
+        folder, names = files("vehicle_detection.drive"), ("report.css", "report.js", "report.html.j2")
+        css, script, template = (folder.joinpath(name).read_text(encoding="utf-8") for name in names)
+        environment = Environment(
+            autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        )
+        filters = {"time": format_time, "plural": pluralize, "value": format_value, "hash": _csp_hash}
+        environment.filters |= filters | {"decimal": decimal, "color": color_index}
+        environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
+        kinds = {event.kind for event in events}
+        return environment.from_string(template).generate(
+            css=css,
+            script=script,
+            source=self._source,
+            report=report,
+            fps=axis.fps,
+            first_time=table.first_time,
+            units=units,
+            notices=_notices(tracks, report, detector),
+            counts=_counts(tracks, table, report, units),
+            video=self._embed(),
+            tracks=tracks,
+            axis=axis,
+            rows=assign_rows(tracks, axis),
+            share_rows=len(tracks) > MAX_ROWS,
+            min_labeled=MIN_LABELED,
+            figures=figures if tracks else [],
+            events=events,
+            event_kinds={kind: name for kind, name in KINDS.items() if kind in kinds},
+            pictures=pictures,
+            drive=count_vehicles(events, table, fps=axis.fps),
+            settings=_settings(detector, report.shape),
+            model=_model_summary(getattr(detector, "model", None)),
+            version=vehicle_detection.__version__,
+            data=data,
+        )
 
     def _embed(self) -> VideoEmbed | None:
         if self._video is None:
@@ -284,69 +332,6 @@ class Figure(NamedTuple):
     label: str = ""  # describes it to those who do not see it
     series: str = ""  # name of the values in the data of the script
     height: int = 150
-
-
-def render_page(
-    table: TrackTable,
-    report: VideoReport,
-    *,
-    events: Sequence[Event],
-    video: VideoEmbed | None,
-    source: str | None,
-    detector: Any,
-    units: str = "metric",
-    pictures: Sequence[TrackPicture] = (),
-    own_speed_mps: Floats | None = None,
-) -> Iterator[str]:
-    """Render the page in pieces; `detector` may lack settings or a model, which are then left out.
-
-    `own_speed_mps` is the camera's speed over ground in each frame of the table, if it is known.
-    """
-    from jinja2 import Environment, StrictUndefined
-
-    axis = TimeAxis(max(report.frames, len(table.counts()), 1), float(report.fps))
-    chosen = UNITS[units]
-    own = None if own_speed_mps is None else own_speed_mps * chosen.speed
-    tracks = [_for_page(track, chosen, own) for track in track_histories(table)]
-    bars, seconds = _count_bars(table, axis)
-    data = _script_data(tracks, axis, own)
-    data |= {"units": [chosen.distance_symbol, chosen.speed_symbol], "counts": bars}
-    quantities = ("distance", *["speed over ground"] * (own is not None), "relative speed")
-    figures = [_count_figure(bars, seconds), *(_curve_figure(each, data, chosen) for each in quantities)]
-    folder, names = files("vehicle_detection.drive"), ("report.css", "report.js", "report.html.j2")
-    css, script, template = (folder.joinpath(name).read_text(encoding="utf-8") for name in names)
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    filters = {"time": format_time, "plural": pluralize, "value": format_value, "hash": _csp_hash}
-    environment.filters |= filters | {"decimal": decimal, "color": color_index}
-    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
-    return environment.from_string(template).generate(
-        css=css,
-        script=script,
-        source=source,
-        report=report,
-        fps=axis.fps,
-        first_time=table.first_time,
-        units=chosen,
-        notices=_notices(tracks, report, detector),
-        counts=_counts(tracks, table, report, chosen),
-        video=video,
-        tracks=tracks,
-        axis=axis,
-        rows=assign_rows(tracks, axis),
-        share_rows=len(tracks) > MAX_ROWS,
-        min_labeled=MIN_LABELED,
-        figures=figures if tracks else [],
-        events=events,
-        event_kinds={kind: name for kind, name in KINDS.items() if any(each.kind == kind for each in events)},
-        pictures=pictures,
-        drive=count_vehicles(events, table, fps=axis.fps),
-        settings=_settings(detector, report.shape),
-        model=_model_summary(getattr(detector, "model", None)),
-        version=vehicle_detection.__version__,
-        data=data,
-    )
 
 
 def _csp_hash(code: str) -> str:
