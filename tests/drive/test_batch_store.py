@@ -46,8 +46,7 @@ def bucket(monkeypatch, tmp_path):
     fsspec.register_implementation("loopback", LoopbackFileSystem, clobber=True)
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(SITE)
-    path = [str(tmp_path / "site"), *filter(None, [os.environ.get("PYTHONPATH")])]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"), prepend=os.pathsep)
     monkeypatch.setattr("vehicle_detection.video.remote._RETRY_DELAYS", (0, 0))
     folder = tmp_path / "bucket"
     (folder / "cam").mkdir(parents=True)

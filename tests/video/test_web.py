@@ -1,14 +1,23 @@
-"""What web servers may refer to, and how long they may take."""
+"""What web servers and files may refer to, and how long servers may take."""
 
 import contextlib
 import http.server
+import socket
+import threading
 import time
 
 import pytest
 
 from tests.helpers import answer, serve
 from tests.video.clips import gray_frames, write_clip
-from vehicle_detection import InvalidInputError, TransientVideoError, VideoError, open_source, read_image
+from vehicle_detection import (
+    InvalidInputError,
+    TransientVideoError,
+    VehicleDetectionError,
+    VideoError,
+    open_source,
+    read_image,
+)
 from vehicle_detection._common import web
 from vehicle_detection.video import ffmpeg as ffmpeg_module
 from vehicle_detection.video import remote
@@ -17,6 +26,13 @@ DASH = """<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011" type="
     mediaPresentationDuration="PT1S"><Period><AdaptationSet mimeType="video/mp4"><Representation id="1"
     bandwidth="1"><BaseURL>{}</BaseURL></Representation></AdaptationSet></Period></MPD>"""
 HLS = "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:0.2,\n{}\n#EXT-X-ENDLIST\n"
+MANIFESTS = {
+    "DASH": DASH,
+    "HLS": HLS,
+    "concat": "ffconcat version 1.0\nfile {}\n",
+    "SDP": "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=a\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 5004 RTP/AVP 96\n"
+    "a=rtpmap:96 H264/90000\n",
+}
 
 
 @contextlib.contextmanager
@@ -46,7 +62,7 @@ def refer(kind, target, data):
             return 200, {}, data
         if kind == "redirect":
             return 302, {"Location": target()}, b""
-        return 200, {}, {"HLS": HLS, "DASH": DASH}[kind].format(target()).encode()
+        return 200, {}, MANIFESTS[kind].format(target()).encode()
 
     return respond
 
@@ -141,3 +157,35 @@ def test_headers_that_drip_end_at_a_deadline(tmp_path, monkeypatch):
         with pytest.raises(VideoError):
             open_source(f"{address}/a.mp4", reconnect=False)
         assert time.monotonic() - begun < 15
+
+
+@pytest.fixture(params=MANIFESTS)
+def manifest(request, tmp_path):
+    """Bytes that name a video of somebody else."""
+    private = write_clip(tmp_path / "private.ts", gray_frames(5))
+    return MANIFESTS[request.param].format(f"file:{private}").encode()
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.ts", "a.m3u8"])
+def test_files_that_name_others_are_refused(manifest, name, tmp_path):
+    (tmp_path / name).write_bytes(manifest)
+    with pytest.raises(VehicleDetectionError, match=name):
+        open_source(tmp_path / name)
+    (tmp_path / name).write_bytes(manifest + b"\0" * 9)
+    with pytest.raises(VehicleDetectionError, match=name):
+        open_source(tmp_path / name)
+
+
+def test_streams_that_name_files_are_refused(manifest):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def send():
+            with contextlib.suppress(OSError):
+                while True:
+                    client, _ = server.accept()
+                    with client:
+                        client.sendall(manifest)
+
+        threading.Thread(target=send, daemon=True).start()
+        with pytest.raises(VehicleDetectionError, match="tcp://"):
+            open_source(f"tcp://127.0.0.1:{server.getsockname()[1]}", reconnect=False)
