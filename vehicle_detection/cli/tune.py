@@ -171,25 +171,20 @@ def _show(table: DataFrame, grid: Mapping[str, Sequence[Any]]) -> None:
     front = set(vd.training.pareto_front(table)["trial"])
     # Options of which the grid has several values; the configuration is a name for the features.
     swept = [name for name, each in grid.items() if name != "C" and len(each) > 1]
-    heads = ["", "configuration", *swept, "C", "accuracy", "training", "search ms"]
-    scored = bool(measured["frame_f1"].notna().any())
+    columns = {"accuracy": ("accuracy", 4), "train_accuracy": ("training", 4), "search_ms": ("search ms", 1)}
+    if measured["frame_f1"].notna().any():
+        columns |= {"frame_f1": ("frames F1", 3), "frame_best_f1": ("best F1", 3)}
     rows = []
     for row in measured.head(_MAX_ROWS).to_dict("records"):
         cells = ["*" * (row["trial"] in front), row["configuration"], *(f"{row[name]}" for name in swept)]
-        cells += [f"{row['C']:g}"]
-        cells += [_text(row[name], 4) for name in ("accuracy", "train_accuracy")]
-        cells += [_text(row["search_ms"], 1)]
-        rows.append(cells + ([_text(row["frame_f1"], 3), _text(row["frame_best_f1"], 3)] if scored else []))
-    heads += ["frames F1", "best F1"] if scored else []
+        values = [(row[name], digits) for name, (_, digits) in columns.items()]
+        numbers = ["" if math.isnan(value) else f"{value:.{digits}f}" for value, digits in values]
+        rows.append([*cells, f"{row['C']:g}", *numbers])
     title = f"{len(measured)} measured; *: no other is as accurate and faster, or as fast and more accurate"
     if rows:
-        print_table(title, heads, rows)
+        print_table(title, ["", "configuration", *swept, "C", *(head for head, _ in columns.values())], rows)
     for row in table[table["message"].notna()].drop_duplicates("configuration").to_dict("records"):
         print_line(f"{row['configuration']} {row['status']}: {row['message']}")
-
-
-def _text(value: float, digits: int) -> str:
-    return "" if math.isnan(value) else f"{value:.{digits}f}"
 
 
 def _draw(table: DataFrame, path: Path, look: Mapping[str, str]) -> None:

@@ -182,12 +182,12 @@ def decode_listings(
     patches = np.empty((total, size, size, 3), np.uint8)
     # OpenCV releases the GIL, so threads suffice. Each decodes a range of rows, as opening a zip takes time.
     with progress_bar(progress, total, unit="patch") as bar, ThreadPoolExecutor(jobs) as pool:
-        futures, start = [], 0
-        for listing in listings:
-            out = patches[start : start + len(listing.names)]
-            parts = np.array_split(np.arange(len(out)), jobs)
-            futures += [pool.submit(_decode_rows, listing, part.tolist(), out, bar.update) for part in parts]
-            start += len(out)
+        outs = np.split(patches, np.cumsum([len(each.names) for each in listings])[:-1])
+        futures = [
+            pool.submit(_decode_rows, listing, rows.tolist(), out, bar.update)
+            for listing, out in zip(listings, outs)
+            for rows in np.array_split(np.arange(len(out)), jobs)
+        ]
         for future in futures:
             future.result()
     return patches

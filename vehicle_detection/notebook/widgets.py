@@ -50,19 +50,16 @@ class Panel:
 
     def watch(self, update: Callable[[dict[str, Any]], None]) -> None:
         """Call `update` with the changed values: now with none, and after each change of a control."""
-        values = self._values()
 
-        def on_change(_: object = None) -> None:
-            nonlocal values
-            previous, values = values, self._values()
+        def on_change(changes: dict[str, Any]) -> None:
             for method, names in METHOD_CONTROLS.items():
                 for name in self.controls.keys() & names:
-                    self.controls[name].disabled = values["method"] != method
-            update({name: value for name, value in values.items() if value != previous[name]})
+                    self.controls[name].disabled = self.controls["method"].value != method
+            update(changes)
 
-        for control in self.controls.values():
-            control.observe(on_change, names="value")
-        on_change()
+        for name, control in self.controls.items():
+            control.observe(lambda change, name=name: on_change({name: change["new"]}), names="value")
+        on_change({})
 
     def on_click(self, action: Callable[[float, float], None]) -> None:
         """Call `action` with the pixel of the image that is clicked; nothing happens without ipyevents."""
@@ -72,9 +69,6 @@ class Panel:
             return
         event = events.Event(source=self.image, watched_events=["click"])
         event.on_dom_event(lambda click: action(float(click["dataX"]), float(click["dataY"])))
-
-    def _values(self) -> dict[str, Any]:
-        return {name: control.value for name, control in self.controls.items()}
 
     def show(self, image: NDArray[np.uint8], text: str) -> None:
         """Show an image, ``(H, W, 3)`` uint8 RGB, and a line of text."""
