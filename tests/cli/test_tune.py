@@ -1,4 +1,5 @@
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +141,15 @@ def test_tune_refuses_bad_input(patches, material, tmp_path, monkeypatch):
     commands.refuse_each("tune", cases, grid=f"--grid 'orient=3 {SMALL}'", **files)
     assert commands.contents(tmp_path) == ["a.csv", "a.jsonl"]
     assert Path("a.csv").read_text() == Path("a.jsonl").read_text() == "a,b\n1,2\n"
+
+
+def test_a_missing_package_is_named_before_anything_is_trained(patches, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    words = ("tune", *patches, "--grid", f"orient=3 {SMALL}", "-o", tmp_path / "table.parquet")
+    assert ".parquet files need pyarrow; pip install pyarrow" in commands.refuse(*words)
+    assert commands.contents(tmp_path) == []
+    (tmp_path / "table.parquet").write_bytes(b"PAR1")
+    assert ".parquet files need pyarrow; pip install pyarrow" in commands.refuse(*words)
 
 
 def test_a_grid_that_cannot_be_trained_is_an_error(patches, tmp_path):

@@ -91,13 +91,13 @@ def write_results(table: DataFrame, path: str | os.PathLike[str]) -> None:
 
 
 def check_replaceable(path: str | os.PathLike[str], name: str) -> None:
-    """Raise if a file exists that is no table of trials or searches, before one is written in its place."""
+    """Raise if a table cannot be written there: without pyarrow, or in place of a file of another kind."""
     file = Path(path)
+    pyarrow = import_pyarrow() if file.suffix.lower() == ".parquet" else None
     if not file.is_file() or not file.stat().st_size:
         return
     try:
-        parquet = file.suffix.lower() == ".parquet"
-        columns = set(import_pyarrow().parquet.read_schema(file).names if parquet else read_results(file))
+        columns = set(read_results(file) if pyarrow is None else pyarrow.parquet.read_schema(file).names)
     except (DatasetError, OSError, ValueError):
         columns = set()
     if not any(own <= columns for own in ({"configuration", "accuracy"}, {"scales", "f1"})):
