@@ -56,6 +56,23 @@ def test_damaged_pictures_are_reported(folder, tmp_path):
     assert "flipped.mp4 is damaged: ffmpeg reports 3 decoding errors (error while decoding MB" in damage
 
 
+def test_gaps_in_the_times_of_a_transport_stream_are_no_undecodable_frames(folder):
+    source = write_clip(folder / "steady.mp4", gray_frames(20))
+    gap = folder / "gap.ts"
+    ffmpeg("-i", source, "-vf", "select='lt(n,5)+gt(n,14)'", "-fps_mode", "vfr", "-bf", 0, gap)
+    frames, damage = count(gap)
+    assert frames == 10
+    assert "gap.ts lacks 10 of 20 frames, or the times of its frames have gaps" in damage
+    ffmpeg("-i", gap, "-c", "copy", copy := folder / "gap.mkv")
+    assert count(copy) == (20, "")
+
+
+def test_an_empty_file_is_named(tmp_path):
+    (tmp_path / "empty.mp4").write_bytes(b"")
+    with pytest.raises(VideoError, match=r"empty.mp4 is not a video .*\(it is empty\)"):
+        read_frames(tmp_path / "empty.mp4")
+
+
 def test_a_range_counts_its_own_frames(lost, clip):
     assert count(lost, end=0.1) == (3, "")
     assert "2 of 5 frames cannot be decoded" in count(lost, end=5 / 29.97)[1]

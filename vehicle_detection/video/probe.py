@@ -231,6 +231,7 @@ def _read_log(path: Path | str, stream: str, demuxer: tuple[str, ...] = ()) -> t
             raise VideoError(f"{name} is a text file, not a video; choose the video")
         truncated = "moov atom not found" in log
         reason = "its index is missing: the recording or copy is incomplete" if truncated else last_line(log)
+        reason = "it is empty" if isinstance(path, Path) and not path.stat().st_size else reason
         message = f"{name} is not a video that ffmpeg can read ({reason}); record or copy it again"
         raise video_error(message, path, code, log)
     if not mapped:

@@ -262,12 +262,17 @@ def find_damage(path: Path | str, info: VideoInfo, end: int, log: str, *, stop: 
     parts = []
     count, message = _decode_errors(log)
     announced = end if end == stop else _announced_frames(path, info, end, exact=count > 0)
-    expected = min(announced, stop or sys.maxsize)
+    expected, name = min(announced, stop or sys.maxsize), source_name(path)
+    if expected > end and not count and not info.container.startswith(_INDEXED):
+        return (
+            f"{name} lacks {expected - end} of {expected} frames, or the times of its frames have gaps, and "
+            "later times are too early; if its rate varies, copy it first: ffmpeg -i IN -c copy OUT.mkv"
+        )
     if expected > end:
         parts.append(f"{expected - end} of {expected} frames cannot be decoded")
     if count:
         parts.append(f"ffmpeg reports {pluralize(count, 'decoding error')} ({message})")
-    return f"{source_name(path)} is damaged: {', and '.join(parts)}; copy or record it again" if parts else ""
+    return f"{name} is damaged: {', and '.join(parts)}; copy or record it again" if parts else ""
 
 
 def _decode_errors(log: str) -> tuple[int, str]:
