@@ -620,6 +620,7 @@ def test_an_unexpected_error_of_a_live_stream_reaches_its_reader(tmp_path, monke
         ("http://nas/..%2F..%2Fx.mp4", ".._.._x.mp4"),
         ("http://nas/08%3A15%3F.mp4", "08_15_.mp4"),  # Windows allows neither
         ("http://nas/", "nas"),
+        ("HTTP://nas/a.mp4?X-Amz-Date=20300101", "a.mp4"),
     ],
 )
 def test_names_of_local_copies(url, name):

@@ -24,12 +24,14 @@ from vehicle_detection._common.text import (
     encodable,
     hide_credentials,
     is_url,
+    is_web_address,
     local_path,
     natural_key,
     parse_yaml,
     pluralize,
     spreadsheet_text,
     stable_url,
+    without_query,
 )
 from vehicle_detection._common.threads import (
     JOBS_VARIABLE,

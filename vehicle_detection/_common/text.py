@@ -54,6 +54,16 @@ def is_url(text: str) -> bool:
     return _URL.match(text) is not None
 
 
+def is_web_address(text: str) -> bool:
+    """Whether a text is the URL of a web server."""
+    return text[:8].lower().startswith(("http://", "https://"))
+
+
+def without_query(text: str) -> str:
+    """Return a web address without its query and fragment, and any other text as it is."""
+    return re.split("[?#]", text)[0] if is_web_address(text) else text
+
+
 def local_path(text: str) -> str:
     """Return the path of a ``file://`` URL, and any other text as it is."""
     scheme = _FILE_URL.match(text)

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from urllib.parse import urlsplit
 
 from vehicle_detection._common.limits import Limit
-from vehicle_detection._common.text import hide_credentials
+from vehicle_detection._common.text import hide_credentials, is_web_address
 from vehicle_detection.errors import InvalidInputError
 
 NETWORK_TIMEOUT = 10.0
@@ -42,7 +42,7 @@ def download_bytes(url: str, limit: Limit) -> bytes:
     from urllib3.exceptions import HTTPError
 
     name, data = hide_credentials(url), bytearray()
-    if not url.lower().startswith(("http://", "https://")):
+    if not is_web_address(url):
         raise InvalidInputError(f"URL {name} must begin with http:// or https://; download the file first")
     try:
         for chunk in read_http(url):

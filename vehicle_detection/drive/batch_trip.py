@@ -28,6 +28,7 @@ from vehicle_detection._common import (
     invalid,
     is_hidden,
     is_url,
+    is_web_address,
     local_path,
     open_parquet,
     stable_url,
@@ -112,7 +113,7 @@ def _list_local(path: Path) -> Iterator[tuple[str, Facts]]:
 
 
 def _list_remote(url: str) -> Iterator[tuple[str, Facts]]:
-    if url.startswith(("http://", "https://")):
+    if is_web_address(url):
         yield url, {}
         return
     filesystem, path = open_filesystem(url)
@@ -209,7 +210,7 @@ def shipped_model(model: str) -> Traversable:
 def _identify(uri: str, facts: Facts) -> dict[str, Any]:
     """Size of a file, and its modification time or entity tag; None and empty where it cannot be found."""
     try:
-        if uri.startswith(("http://", "https://")):
+        if is_web_address(uri):
             return with_retries(lambda: _identify_http(uri))
         if is_url(uri):
             filesystem, path = open_filesystem(uri)
@@ -409,7 +410,7 @@ def _with_urls(message: str, task: Mapping[str, Any], folder: Path) -> str:
 def _open(task: Mapping[str, Any], folder: Path) -> FrameSource:
     """Open the files of a trip; remote ones are copied first, unless a single one can be read in place."""
     files = task["files"]
-    if len(files) == 1 and files[0].startswith(("http://", "https://")):
+    if len(files) == 1 and is_web_address(files[0]):
         return open_source(files[0])
     paths = []
     for number, file in enumerate(files):

@@ -21,7 +21,15 @@ from datetime import datetime, timedelta
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
-from vehicle_detection._common import available_cores, check, describe, is_url, pluralize
+from vehicle_detection._common import (
+    available_cores,
+    check,
+    describe,
+    is_url,
+    is_web_address,
+    pluralize,
+    without_query,
+)
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.video import FrameSource, Source, is_video_file, list_files, open_source, probe_video
 
@@ -163,7 +171,7 @@ def _warn_of_dates(segments: Sequence[_Segment]) -> None:
 
 def _probe_length(file: File) -> float:
     """Length of a video in seconds; 0 if it is unknown, as on storage from which it would be copied."""
-    copied = is_url(str(file)) and not str(file).startswith(("http://", "https://"))
+    copied = is_url(str(file)) and not is_web_address(str(file))
     try:
         return 0.0 if copied else probe_video(file).duration
     except (InvalidInputError, VideoError):  # reported when its trip is processed
@@ -243,10 +251,7 @@ def segment_clock(source: FrameSource) -> tuple[tuple[float, float], ...]:
 def _parse_name(file: File) -> _Segment:
     """Read time, number and camera from the name of a file, or of a URL: its query may hold another time."""
     text = os.fspath(file)
-    if is_url(text):
-        name = PurePosixPath(re.split("[?#]", text)[0] if text.startswith(("http://", "https://")) else text)
-    else:
-        name = PurePosixPath(PurePath(text).as_posix())
+    name = PurePosixPath(without_query(text) if is_url(text) else PurePath(text).as_posix())
     stem = name.stem
     gopro = _GOPRO.match(stem)
     if gopro:  # the chapter comes before the number of the recording

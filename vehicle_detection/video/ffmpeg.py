@@ -29,6 +29,7 @@ from vehicle_detection._common import (
     REFUSED,
     Limit,
     hide_credentials,
+    is_web_address,
     web_proxy,
 )
 from vehicle_detection.errors import TransientVideoError, VideoError
@@ -79,7 +80,7 @@ def input_options(path: Path | str) -> tuple[str, ...]:
 
 def network_options(url: str) -> tuple[str, ...]:
     """Return the options of ffmpeg that open a URL, which may be that of a playlist at an HTTP server."""
-    if not url.lower().startswith(("http://", "https://")):
+    if not is_web_address(url):
         return (*restrict_input(_NETWORK, ",rtsp,rtp"), "-i", url)
     proxy = web_proxy(url)
     options = restrict_input(f"{_NETWORK},data", ",hls,dash")

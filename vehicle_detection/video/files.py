@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import glob
 import os
-import re
 from collections.abc import Iterator
 from pathlib import Path, PurePath
 
-from vehicle_detection._common import check, check_regular_file, is_hidden, is_url, natural_key
+from vehicle_detection._common import check, check_regular_file, is_hidden, is_url, natural_key, without_query
 from vehicle_detection.errors import InvalidInputError
 
 VIDEO_SUFFIXES = {
@@ -22,7 +21,7 @@ IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
 def is_video_file(file: Path | str) -> bool:
     """Whether the name of a file, or a URL, has the suffix of a video, and is not hidden."""
     text = os.fspath(file)
-    name = PurePath(re.split("[?#]", text)[0] if text.startswith(("http://", "https://")) else text)
+    name = PurePath(without_query(text))
     return name.suffix.lower() in VIDEO_SUFFIXES and not name.name.startswith(".")
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import unquote
 
-from vehicle_detection._common import hide_credentials, read_http
+from vehicle_detection._common import hide_credentials, is_web_address, read_http, without_query
 from vehicle_detection.errors import InvalidInputError, TransientVideoError
 
 Result = TypeVar("Result")
@@ -27,7 +27,7 @@ def download(url: str, folder: Path) -> Path:
     name = hide_credentials(url)
     path = folder / file_name(url)
     try:
-        if url.startswith(("http://", "https://")):
+        if is_web_address(url):
             with_retries(lambda: _download_http(url, path))
         else:
             filesystem, remote = open_filesystem(url)
@@ -49,8 +49,7 @@ def download(url: str, folder: Path) -> Path:
 
 def file_name(url: str) -> str:
     """Name of a local copy: the end of the URL's path, without what Windows does not allow in names."""
-    path = re.split("[?#]", url)[0] if url.startswith(("http://", "https://")) else url
-    name = unquote(path.rstrip("/").rpartition("/")[2])
+    name = unquote(without_query(url).rstrip("/").rpartition("/")[2])
     return re.sub(r'[\x00-\x1f/\\:?*"<>|]', "_", name)[-_MAX_NAME:] or "video"
 
 
