@@ -147,15 +147,6 @@ class _QueuedFrame:
     dropped: int = 0  # frames that a live source dropped before this one
 
 
-@dataclass
-class _Searched:
-    """A searched frame with its result, and those before it that were not searched."""
-
-    between: list[_QueuedFrame]
-    item: _QueuedFrame | None  # None: the source ends after the frames between
-    result: Any
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Plan:
     """What `track` is to do.
@@ -285,52 +276,51 @@ class _Pipeline:
 
     def _track_frames(self) -> Iterator[Any]:
         """Track the searched frames, and yield the results of all frames in their order."""
-        waiting: list[_QueuedFrame] = []
-        held: deque[_Searched] = deque()
+        block: list[_QueuedFrame] = []  # frames that are not searched, then one that is
+        held: deque[tuple[list[_QueuedFrame], Any]] = deque()  # blocks with the results of searched frames
         before, delay = None, self._plan.delay
         for item in self._queue:
+            block.append(item)
             if item.search is None:
-                waiting.append(item)
                 continue
-            held.append(_Searched(waiting, item, self._track(item, waiting)))
-            waiting = []
+            held.append((block, self._track(item, len(block))))
+            block = []
             if delay:
-                results = backfill_results([searched.result for searched in held])
-                for searched, result in zip(held, results, strict=True):
-                    searched.result = result
+                results = backfill_results([result for _, result in held])
+                held = deque((items, result) for (items, _), result in zip(held, results, strict=True))
             if len(held) > delay:
-                result = held[0].result
-                yield from self._release(before, held.popleft())
+                items, result = held.popleft()
+                yield from self._release(items, before, result)
                 before = result
-        for searched in (*held, _Searched(waiting, None, None)):
-            yield from self._release(before, searched)
-            before = searched.result
+        for items, result in (*held, (block, None)):
+            yield from self._release(items, before, result)
+            before = result
 
-    def _track(self, item: _QueuedFrame, waiting: list[_QueuedFrame]) -> Any:
-        """Track a searched frame after the `waiting` ones, which are not searched."""
+    def _track(self, item: _QueuedFrame, frames: int) -> Any:
+        """Track a searched frame, the last one of a block of `frames`."""
         assert item.search is not None
         try:
             found, seconds = item.search.result()
         except DetectorError as error:
             raise DetectorError(f"at {item.time:.2f} s: {error}") from error
         self.searching += seconds
-        frames = 1 + len(waiting) + item.dropped
-        return self._detector.track(found, time=item.time, frames=frames, cut=item.cut)
+        return self._detector.track(found, time=item.time, frames=frames + item.dropped, cut=item.cut)
 
-    def _release(self, before: Any, searched: _Searched) -> Iterator[Any]:
-        """Yield the results of frames between two searched ones, interpolated, and of the second one."""
-        items, results = searched.between, list[Any]()
-        if items:
-            times = [item.time for item in items]
-            results = interpolate_results(before, searched.result, times, self._plan.source.info.shape)
-        if searched.item is not None:
-            items, results = [*items, searched.item], [*results, searched.result]
-        for item, result in zip(items, results, strict=True):
-            for name, seconds in result.seconds.items():
+    def _release(self, items: list[_QueuedFrame], before: Any, result: Any) -> Iterator[Any]:
+        """Yield the results of a block: interpolated ones, and that of its searched frame.
+
+        `before` is the result of the searched frame before the block; without `result`, the source ends.
+        """
+        results = [] if result is None else [result]
+        times = [item.time for item in items[: len(items) - len(results)]]
+        if times:
+            results = interpolate_results(before, result, times, self._plan.source.info.shape) + results
+        for item, each in zip(items, results, strict=True):
+            for name, seconds in each.seconds.items():
                 if name != "search":  # measured here, because a detector may omit it
                     self.stages[name] += seconds
             frame, item.frame = item.frame, None
-            yield result if frame is None else replace(result, frame=frame.rgb())
+            yield each if frame is None else replace(each, frame=frame.rgb())
 
 
 def _wait_for_one(running: deque[Future[Any]]) -> None:
