@@ -173,6 +173,8 @@ def test_the_record_of_a_damaged_file_says_what_is_missing(clip, model, tmp_path
     assert counts(run(str(source), tmp_path / "out", model, tracks_only=True)) == (1, 0, 0, 0)
     (record,) = records(tmp_path / "out").values()
     assert "lost.mp4 is damaged: 9 of 12 frames cannot be decoded" in record["damage"]
+    status = batch_status(tmp_path / "out")
+    assert (status.done, dict(status.messages)) == (1, {str(source): record["damage"]})
 
 
 def test_a_full_disk_is_an_error_that_the_next_run_repeats(card, model, tmp_path, monkeypatch):

@@ -279,8 +279,10 @@ class BatchStatus:
 
     Attributes
     ----------
-    done, failed, errors, messages
+    done, failed, errors
         As in the `BatchReport` of a run.
+    messages
+        Message of each failed trip and each error, and what is damaged in other trips, by the first source.
     frames, tracks
         Number of frames and of tracks of the processed trips.
     video_seconds, work_seconds
@@ -387,8 +389,9 @@ def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
         if record["status"] == DONE:
             for name in _NUMBERS:
                 sums[name] += record.get(name) or 0
-        else:
-            messages[record["sources"][0]["uri"]] = record.get("message") or ""
+        message = record.get("damage" if record["status"] == DONE else "message") or ""
+        if message or record["status"] != DONE:
+            messages[record["sources"][0]["uri"]] = message
     return BatchStatus(
         **{name: counts[status] for name, status in COUNTS.items()},
         frames=sums["frames"],
