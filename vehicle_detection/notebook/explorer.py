@@ -1,7 +1,7 @@
 """An explorer for notebooks: change the detector's parameters and see what it finds in a frame.
 
-A frame is searched once per horizon and band; thresholds and region parameters only select from the cached
-result. `Explorer.widget` adds sliders that set the same parameters.
+A frame is searched once per horizon and selection of bands; thresholds and region parameters only select from
+the cached result. `Explorer.widget` adds sliders that set the same parameters.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import functools
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import cv2
 import numpy as np
@@ -37,7 +37,7 @@ from vehicle_detection.images import image_array
 from vehicle_detection.network import NetworkModel, NetworkParams
 from vehicle_detection.notebook.widgets import METHOD_CONTROLS, Panel, build_widgets
 from vehicle_detection.regions import RegionParams, find_vehicles
-from vehicle_detection.search import SearchParams
+from vehicle_detection.search import SearchParams, SearchResult
 from vehicle_detection.svm import VehicleClassifier
 
 Image = NDArray[np.uint8]
@@ -59,14 +59,6 @@ _MAX_COLOR_SCORE = 2.0  # windows of this score or more are drawn in the brighte
 
 Value = TypeVar("Value")
 Params = TypeVar("Params", HeatParams, RegionParams)
-
-
-class _FrameWindows(NamedTuple):
-    """The cached result of a search."""
-
-    windows: Detections
-    bands: NDArray[np.intp] | None  # band number of each window; None for a search without bands
-    vehicles: Detections | None  # boxes predicted by the model
 
 
 def _cached(method: Callable[[Explorer], Value]) -> Callable[[Explorer], Value]:
@@ -133,7 +125,9 @@ class Explorer:
         self.camera = detector.camera
         self._search = detector.model.open_search()
         self._read_frame = functools.lru_cache(_CACHED_FRAMES)(lambda name: image_array(images[name]))
-        self._search_frame = functools.lru_cache(_CACHED_SEARCHES)(self._search_frame_uncached)
+        self._search_frame = functools.lru_cache(_CACHED_SEARCHES)(
+            lambda name, params: self._search.find(self._read_frame(name), params)
+        )
         self._compute = functools.lru_cache(4)(lambda method, state: method(self))
         self.model = detector.model
         self.names = tuple(images)
@@ -229,11 +223,8 @@ class Explorer:
     @_cached
     def windows(self) -> Detections:
         """Positive windows of the current frame."""
-        found = self._find()
-        selected = found.windows.scores > self.search_params.min_score
-        if found.bands is not None:
-            selected &= np.isin(found.bands, self.bands)
-        return found.windows[selected]
+        found = self._all_windows()
+        return found[found.scores > self.search_params.min_score]
 
     @_cached
     def heat_map(self) -> NDArray[np.float32]:
@@ -245,7 +236,7 @@ class Explorer:
         """Boxes of the vehicles, equal to those of `VehicleDetector.detect` with these parameters."""
         if self.method == "heat":
             return label_heat(self.heat_map(), self.heat_params)
-        vehicles = self._find().vehicles
+        vehicles = None if self._all_bands else self._find().vehicles
         if vehicles is None:
             shape = self._read_frame(self.frame).shape
             vehicles = find_vehicles(self.windows(), self.camera, shape, self.group_params)
@@ -285,11 +276,7 @@ class Explorer:
         `options` are further arguments of `VehicleDetector`, such as ``camera``, which gets the current
         horizon. An `InvalidInputError` is raised if no band is selected.
         """
-        params: Any = self.search_params
-        if self._all_bands:
-            params = dataclasses.replace(
-                params, bands=tuple(self._all_bands[number] for number in self.bands)
-            )
+        params = self._selected_params()
         camera = open_camera(options.pop("camera", self.camera))
         if self.camera.horizon_is_known and camera is not self.camera:
             camera = camera.with_horizon(self.camera.horizon)
@@ -322,8 +309,7 @@ class Explorer:
     def summary(self) -> str:
         """Describe in a line what was found, and the explained box."""
         height, width = self._read_frame(self.frame).shape[:2]
-        found = self._find()
-        total = "" if found.bands is None else f" of {len(found.windows):,}"
+        total = f" of {len(self._all_windows()):,}" if self._all_bands else ""
         explanation = self.explanation()
         return (
             f"{self.frame}, {width}x{height}: {len(self.windows()):,}{total} windows above "
@@ -377,25 +363,21 @@ class Explorer:
         scale = min(self._width / self._read_frame(self.frame).shape[1], 1.0)
         panel.controls["box"].value = self.box_at(x / scale, y / scale)
 
-    def _find(self) -> _FrameWindows:
+    def _selected_params(self) -> Any:
+        """Search parameters with the selected bands."""
+        if not self._all_bands:
+            return self.search_params
+        bands = tuple(self._all_bands[number] for number in self.bands)
+        return dataclasses.replace(self.search_params, bands=bands)
+
+    def _find(self) -> SearchResult:
         """Search the current frame with a low threshold, which serves all higher ones."""
         lowest = _ALL_SCORES if self._all_bands else min(0.0, self.search_params.min_score)
-        return self._search_frame(self.frame, dataclasses.replace(self.search_params, min_score=lowest))
+        return self._search_frame(self.frame, dataclasses.replace(self._selected_params(), min_score=lowest))
 
-    def _search_frame_uncached(self, name: str, params: Any) -> _FrameWindows:
-        image = self._read_frame(name)
-        if not self._all_bands:
-            found = self._search.find(image, params)
-            return _FrameWindows(found.windows, None, found.vehicles)
-        params.place(image.shape)  # raises if no band fits
-        parts = {}
-        for number, band in enumerate(params.bands):
-            if band.place(image.shape, params.horizon, params.horizontal_padding) is not None:
-                parts[number] = self._search.find(image, dataclasses.replace(params, bands=(band,))).windows
-        boxes = np.concatenate([part.boxes for part in parts.values()])
-        scores = np.concatenate([part.scores for part in parts.values()])
-        numbers = np.repeat(list(parts), [len(part) for part in parts.values()])
-        return _FrameWindows(Detections(boxes, scores), numbers, None)
+    def _all_windows(self) -> Detections:
+        """Windows of any score in the selected bands."""
+        return Detections.empty() if self._all_bands and not self.bands else self._find().windows
 
 
 def _replace(params: Params, **changes: Any) -> Params:
