@@ -277,9 +277,7 @@ def test_the_remedy_without_supervision(monkeypatch):
 
 
 def test_a_table_of_detections():
-    found = Detections(
-        np.array([[0.0, 1, 50, 40], [2, 3, 60, 50]]), np.array([1.5, 0.5]), np.array([0.8, 0.6])
-    )
+    found = Detections([[0, 1, 50, 40], [2, 3, 60, 50]], [1.5, 0.5], [0.8, 0.6])
     table = found.to_pandas()
     assert list(table) == ["x1", "y1", "x2", "y2", "score", "confidence"]
     assert table.iloc[1].tolist() == [2, 3, 60, 50, 0.5, 0.6]

@@ -57,9 +57,7 @@ def test_lateral_offset_of_a_box_across_the_middle_is_zero():
 
 
 def test_truncated_edges_allow_for_a_search_that_ends_short_of_the_border():
-    boxes = np.array(
-        [[0.0, 300.0, 100.0, 400.0], [1076.0, 400.0, 1276.0, 500.0], [600.0, 400.0, 700.0, 719.0]]
-    )
+    boxes = np.array([[0.0, 300, 100, 400], [1076, 400, 1276, 500], [600, 400, 700, 719]])
     assert truncated_edges(boxes, SHAPE).tolist() == [
         [True, False, False, False],
         [False, False, True, False],

@@ -384,12 +384,7 @@ def test_the_fast_search_is_used_where_it_applies(models, monkeypatch):
     svc, scaler = case.model
     grid = GridSearchCV(LinearSVC(random_state=0, max_iter=10_000), {"C": [0.01]}, cv=2)
     grid.fit(scaler.transform(case.X), LABELS)
-    given = [
-        (svc, scaler),
-        (grid, scaler),
-        (grid.best_estimator_, scaler),
-        tuple(map(old_version, case.model)),
-    ]
+    given = [(svc, scaler), (grid, scaler), (grid.best_estimator_, scaler), [*map(old_version, case.model)]]
     monkeypatch.setattr(search_module._Estimators, "predict", None)
     arguments, hits = (9, 8, 2, (16, 16), 16), []
     for model in given:
@@ -723,9 +718,7 @@ def test_bad_input_raises_an_error_of_the_library(call_data, models, form, messa
 
 def test_an_unknown_option_names_the_function_that_was_called(models):
     with pytest.raises(TypeError, match=r"find_cars\(\) got an unexpected keyword argument 'draw'"):
-        lesson.find_cars(
-            FRAMES["uint8"], 0, 90, 1, *models["all", "uint8"].model, 9, 8, 2, 16, 16, draw=False
-        )
+        lesson.find_cars(FRAMES["uint8"], 0, 9, 1, *models["all", "uint8"].model, 9, 8, 2, 16, 16, draw=False)
 
 
 def test_features_of_an_image_with_a_picture_of_the_hog():

@@ -176,9 +176,7 @@ def test_boxes_are_smoothed(options, frames, expected):
 
 def test_the_detector_smooths_its_boxes(scene):
     boxes = iter([[BOX], []])
-    detector = HeatmapDetector(
-        lambda image: next(boxes), threshold=0, n_frames=1, smoother=BoxSmoother(hold=1)
-    )
+    detector = HeatmapDetector(lambda _: next(boxes), threshold=0, n_frames=1, smoother=BoxSmoother(hold=1))
     assert [detector.find_cars(scene) for _ in range(2)] == [[((0, 0), (39, 39))]] * 2
 
 

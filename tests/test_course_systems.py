@@ -20,7 +20,7 @@ from sklearn.tree import DecisionTreeClassifier
 import vehicle_detection.course
 from tests import lesson_reference
 from tests.helpers import rendered_patches
-from vehicle_detection import read_image, render_scene, write_image
+from vehicle_detection import render_scene, write_image
 
 pytestmark = pytest.mark.filterwarnings("ignore:the image has values 0-1, which")
 
@@ -159,9 +159,7 @@ def system_4(lesson, data):
     clf = DecisionTreeClassifier(max_depth=4, random_state=0).fit(scaler.transform(X), y)
 
     gray = lesson.convert_color(images[0], "RGB2GRAY")
-    _, hog_image = lesson.get_hog_features(
-        gray, orient, pix_per_cell, cell_per_block, vis=True, feature_vec=True
-    )
+    _, hog_image = lesson.get_hog_features(gray, orient, pix_per_cell, cell_per_block, vis=True)
     figure, (left, right) = plt.subplots(1, 2)
     left.imshow(gray, cmap="gray")
     right.imshow(hog_image, cmap="gray")
@@ -211,41 +209,3 @@ def test_a_published_system_runs_with_another_import(system, data):
     np.testing.assert_array_equal(found["heat"], expected["heat"])
     for image, other in zip(found["drawn"], expected["drawn"], strict=True):
         np.testing.assert_allclose(image, other, rtol=1e-6)
-
-
-@pytest.mark.realdata
-def test_the_first_write_up_finds_its_windows(real_data, some_real_patches):
-    """Its windows, features and split, with PNG files as 0-255 and as 0-1: about 18 and about 130 hits."""
-    lesson = vehicle_detection.course
-    patches, labels = some_real_patches
-    options = {
-        "color_space": "LUV", "spatial_size": (16, 16), "hist_bins": 16, "orient": 8, "pix_per_cell": 8,
-        "cell_per_block": 2, "hog_channel": 0, "transform_sqrt": True,
-    }  # fmt: skip
-    image = read_image(real_data / "test_images" / "test6.jpg")
-    windows = lesson.slide_window(image, [650, None], [395, 530], (96, 96), (0.9, 0.5))
-    windows += lesson.slide_window(image, [650, None], [380, 590], (110, 145), (0.7, 0.6))
-    windows += lesson.slide_window(image, [650, None], [370, 590], (155, 165), (0.6, 0.5))
-    windows += lesson.slide_window(image, [650, None], [400, 700], (170, 200), (0.6, 0.5))
-
-    def hot_windows(images, labels):
-        X = np.array(lesson.extract_features(images, **options), np.float64)
-        scaler = StandardScaler().fit(X)
-        X_train, X_test, y_train, y_test = train_test_split(
-            scaler.transform(X), labels, test_size=0.2, random_state=42
-        )
-        svc = LinearSVC(random_state=0).fit(X_train, y_train)
-        return (
-            lesson.search_windows(image, windows, svc, scaler, **options),
-            len(X_test),
-            svc.score(X_test, y_test),
-        )
-
-    hot, samples, accuracy = hot_windows(patches, labels)
-    assert (len(windows), samples) == (130, 356)
-    assert 5 < len(hot) < 30  # 18 with all patches in the order of the files
-    assert accuracy > 0.95
-    units = list(patches[::2].astype(np.float32) / 255)
-    with pytest.warns(UserWarning, match="fitted on values 0-1, but the image has values 0-255"):
-        hot, *_ = hot_windows(units, labels[::2])
-    assert len(hot) > 120

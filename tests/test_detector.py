@@ -83,9 +83,7 @@ def make(*, regions="fitted", **options):
 
 def drive(frames=12):
     """A car that drifts to the right, and one that comes and goes."""
-    return [
-        frame_with(moved(CAR, 2 * index), *([OTHER] if 4 <= index < 9 else [])) for index in range(frames)
-    ]
+    return [frame_with(moved(CAR, 2 * index), *[OTHER] * (4 <= index < 9)) for index in range(frames)]
 
 
 def ids_of(result):
@@ -337,9 +335,7 @@ def test_frames_without_times_and_frame_rate_warn_once_of_their_speeds(method):
 def test_the_documented_code_for_own_frames(capsys):
     page = (ROOT / "docs" / "sources.md").read_text()
     sections = dict(section.split("\n", 1) for section in page.split("\n## ")[1:])
-    blocks = {
-        title: text.partition("```python\n")[2].partition("\n```")[0] for title, text in sections.items()
-    }
+    blocks = {title: text.split("```python\n", 1)[-1].split("\n```")[0] for title, text in sections.items()}
     drive = render_drive(frames=3, shape=(360, 640), scenario="overtaking")
     names = {"vd": vehicle_detection, "frames": [scene.image for scene in drive]}
     exec(blocks["Frames of your own"], names)
@@ -370,11 +366,10 @@ def test_bad_options_are_refused(options, message):
 
 
 def test_heat_thresholds_depend_on_the_model():
-    thresholds = {
-        model: Detector(model, region_params=HeatParams()).heat_params.threshold
-        for model in ("default", "highway")
-    }
-    assert thresholds == {"default": 0.0, "highway": 2.0}
+    thresholds = [
+        Detector(each, region_params=HeatParams()).heat_params.threshold for each in ("default", "highway")
+    ]
+    assert thresholds == [0.0, 2.0]
     assert make(region_params=HeatParams(threshold=7.0)).detector.heat_params.threshold == 7
     with pytest.warns(UserWarning, match="the heat threshold 50 does not fit the density") as caught:
         VehicleDetector("highway", region_params=HeatParams(threshold=50.0))
@@ -472,9 +467,7 @@ def test_parts_can_be_passed_in():
 
 @pytest.fixture(scope="module")
 def scene():
-    cars = [
-        SceneVehicle(distance_m=distance, lateral_m=lateral) for distance, lateral in ((14, 0), (30, 3.6))
-    ]
+    cars = [SceneVehicle(distance_m=ahead, lateral_m=lateral) for ahead, lateral in ((14, 0), (30, 3.6))]
     return render_scene(shape=(360, 640), vehicles=cars, lane=1, random_state=3)
 
 

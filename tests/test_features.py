@@ -36,9 +36,7 @@ def assert_equals_the_reference(patches, params):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_presets_equal_the_reference(preset):
-    assert_equals_the_reference(
-        np.concatenate([PATCHES, rendered_patches(12)[0]]), FeatureParams.preset(preset)
-    )
+    assert_equals_the_reference(np.vstack([PATCHES, rendered_patches(12)[0]]), FeatureParams.preset(preset))
 
 
 @pytest.mark.parametrize(
@@ -78,9 +76,7 @@ def test_other_parameters_equal_the_reference(changes):
 
 @st.composite
 def feature_params(draw):
-    parts = draw(
-        st.sampled_from([(True, True, True), (True, False, True), (False, True, True), (False,) * 2])
-    )
+    parts = draw(st.sampled_from([(True, True), (True, False), (False, True), (False, False)]))
     cell = draw(st.integers(4, 64))
     block = draw(st.integers(1, min(4, 64 // cell)))
     return FeatureParams(
@@ -248,12 +244,8 @@ def test_convert_color(color_space):
     np.testing.assert_array_equal(convert_color(patch[8:40, ::-2], color_space), converted[8:40, ::-2])
     red = np.full((1, 1, 3), (255, 0, 0), np.uint8)
     expected = {"HSV": [0, 255, 255], "HLS": [0, 128, 255], "YCrCb": [76, 255, 85], "RGB": [255, 0, 0]}
-    assert (
-        color_space not in expected or convert_color(red, color_space)[0, 0].tolist() == expected[color_space]
-    )
-    for arguments, message in (
-        ((patch, "BGR"), "color_space must be one of"),
-        ((patch / 255,), "image must"),
-    ):
+    found = convert_color(red, color_space)[0, 0].tolist()
+    assert expected.get(color_space, found) == found
+    for arguments, message in (((patch, "BGR"), "color_space must be"), ((patch / 255,), "image must")):
         with pytest.raises(InvalidInputError, match=message):
             convert_color(*arguments)

@@ -89,9 +89,7 @@ def test_a_band_is_relative_to_the_horizon():
 def test_a_band_scales_with_the_frame():
     (full,) = SEARCH.place((720, 1280))
     (half,) = SEARCH.place((360, 640))
-    assert half == PixelBand(
-        *(value // 2 for value in (full.x1, full.y1, full.x2, full.y2)), (32, 32), (4, 4)
-    )
+    assert half == PixelBand(*(side // 2 for side in (full.x1, full.y1, full.x2, full.y2)), (32, 32), (4, 4))
     # A portrait frame scales by its longer side.
     assert SEARCH.place((1280, 720)) == (PixelBand(0, 640, 720, 896, (64, 64), (8, 8)),)
     bands = SearchParams.preset("three-scales").place((720, 1280))

@@ -120,9 +120,7 @@ def test_columns_beyond_the_frame_are_replicated(preset):
     classifier = random_classifier(FeatureParams.preset(preset))
     band = PixelBand(-32, 50, 330 + 32, 130, (64, 64), (8, 8))
     assert_equals_the_reference(IMAGE, band, classifier)
-    padded = np.concatenate(
-        [IMAGE[:, :1].repeat(32, axis=1), IMAGE, IMAGE[:, -1:].repeat(32, axis=1)], axis=1
-    )
+    padded = np.concatenate([IMAGE[:, :1].repeat(32, 1), IMAGE, IMAGE[:, -1:].repeat(32, 1)], axis=1)
     np.testing.assert_array_equal(resize_band(IMAGE, band), padded[50:130])
 
 

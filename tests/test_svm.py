@@ -151,9 +151,8 @@ def test_any_linear_estimator(patches, labels, options):
     grid = GridSearchCV(LinearSVC(random_state=0), {"C": [1e-2]}, cv=2)
     found = train_classifier(patches, labels, params=SMALL, estimator=grid)
     expected = train_classifier(patches, labels, params=SMALL, options=TrainingOptions(C=1e-2))
-    np.testing.assert_allclose(
-        found.decision_function(patches), expected.decision_function(patches), rtol=1e-3, atol=1e-3
-    )
+    scores = (each.decision_function(patches) for each in (found, expected))
+    np.testing.assert_allclose(*scores, rtol=1e-3, atol=1e-3)
 
 
 def test_estimators_that_cannot_be_used(patches, labels):

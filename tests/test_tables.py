@@ -110,7 +110,7 @@ def test_appended_frames_and_their_tracks(frames):
 
 def test_results_are_appended():
     table = TrackTable.from_results(
-        iter([result(0, track(1, speed_mps=2.0), track(9, shown=False)), result(1), result(2)])
+        iter([result(0, track(1, speed_mps=2), track(9, shown=False)), *map(result, (1, 2))])
     )
     assert (len(table), table.frame_keys, table["speed_mps"].tolist()) == (1, (0, 1, 2), [2.0])
     assert np.isnan(table["distance_m"]).all()

@@ -131,9 +131,8 @@ def test_both_borders_differ_only_in_the_gradients():
     own = search_windows(image, window, classifier, min_score=None)
     shared = score_windows(image, window, classifier)
     np.testing.assert_allclose(shared, own.scores, atol=1e-5)
-    np.testing.assert_allclose(
-        own.scores, classifier.decision_function(single_img_features(image, params)[None]), atol=1e-5
-    )
+    features = single_img_features(image, params)
+    np.testing.assert_allclose(own.scores, classifier.decision_function(features[None]), atol=1e-5)
     wide = image_of(80, 96, 5)
     window = [[16, 8, 80, 72]]
     own = search_windows(wide, window, classifier, min_score=None)

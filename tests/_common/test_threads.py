@@ -110,9 +110,7 @@ def test_a_team_processes_expensive_items_first():
 def test_a_team_uses_all_threads():
     together = threading.Barrier(3)
     with ThreadTeam(3, name="team") as team:
-        names = team.map(
-            lambda _: (together.wait(60), threading.current_thread().name)[1], range(3), cost=float
-        )
+        names = team.map(lambda _: (together.wait(60), threading.current_thread().name)[1], "abc", cost=ord)
     assert len(set(names)) == 3
     assert threading.current_thread().name in names
 

@@ -230,9 +230,7 @@ def test_detect_and_video_blur_vehicles(tmp_path):
         succeed("video", clip, "-o", tmp_path / f"{folder}.mp4", "--preset", "ultrafast", *words)
         with read_frames(tmp_path / f"{folder}.mp4") as frames:
             pictures = read_image(tmp_path / folder / "road.png"), next(frames)[2]
-        contrasts.append(
-            [np.abs(np.diff(picture[inside].mean(axis=2), axis=0)).max() for picture in pictures]
-        )
+        contrasts.append([np.abs(np.diff(picture[inside].mean(2), axis=0)).max() for picture in pictures])
     assert (np.array(contrasts[1]) < 0.5 * np.array(contrasts[0])).all()
 
 

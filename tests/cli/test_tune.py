@@ -160,14 +160,3 @@ def test_a_grid_that_cannot_be_trained_is_an_error(patches, tmp_path):
         message = "error: --grid has no configuration that can be trained, for the reasons above"
         assert result.stderr.splitlines()[-1] == message
         assert not (tmp_path / "t.csv").exists()
-
-
-def test_a_single_patch_of_each_class(patches, tmp_path):
-    words = []
-    for name, folder in (("--vehicles", patches[1]), ("--non-vehicles", patches[3])):
-        (tmp_path / name).mkdir()
-        first = min(folder.rglob("*.png"))
-        write_image(tmp_path / name / "1.png", read_image(first))
-        words += [name, tmp_path / name]
-    message = commands.refuse("tune", *words, "--grid", "orient=3", "-o", tmp_path / "t.csv")
-    assert "--vehicles and --non-vehicles must hold a folder of two or more patches; add" in message

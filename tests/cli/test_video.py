@@ -62,9 +62,7 @@ def test_video_writes_an_annotated_copy_and_tracks(clip, tmp_path):
     target, tracks = tmp_path / "out.mp4", tmp_path / "tracks.csv"
     out = succeed("video", clip, "-o", target, "--tracks", tracks, "--preset", "ultrafast", "--profile")
     lines = out.splitlines()
-    assert re.match(
-        r"10 frames of 480x270 in \d+\.\d s: .* frames/s, .* times real time, \d+ vehicle", lines[0]
-    )
+    assert re.match(r"10 frames of 480x270 in \d+\.\d s: .* frames/s, .* real time, \d+ vehicle", lines[0])
     stages = ["stage", "decode", "search", "regions", "track", "draw", "encode"]
     assert [line.split()[0] for line in lines[1:8]] == stages
     assert lines[-1] == f"wrote {target}, {tracks}"
@@ -105,9 +103,7 @@ def test_video_writes_events_and_a_summary(clip, tmp_path):
     target, events, clips = tmp_path / "out.mp4", tmp_path / "events.json", tmp_path / "clips"
     words = ["--events", events, "--clips", clips, "--own-speed", 100, "--preset", "ultrafast"]
     lines = succeed("video", clip, "-o", target, *words).splitlines()
-    assert re.search(
-        r"overtook \d+ vehicles?, was overtaken by \d+, met \d+ oncoming.* in view on average", lines[1]
-    )
+    assert re.search(r"overtook \d+ vehicles?, was overtaken by \d+, met \d+ oncoming.* in view on", lines[1])
     assert lines[-1] == f"wrote {target}, {events}, {clips}"
     found = json.loads(events.read_text())
     assert [path.suffix for path in clips.iterdir()] == [".mp4"] * len(found)

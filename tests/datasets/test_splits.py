@@ -239,9 +239,7 @@ def test_pairs_agree_with_the_correlation_of_thumbnails(seed, count, threshold):
         best = expected[row].max()
         if abs(best - threshold) > 1e-4:
             assert (row in pairs[:, 0]) == (best > threshold)
-    np.testing.assert_allclose(
-        expected[pairs[:, 0], pairs[:, 1]], expected[pairs[:, 0]].max(axis=1), atol=1e-4
-    )
+    np.testing.assert_allclose(expected[pairs[:, 0], pairs[:, 1]], expected[pairs[:, 0]].max(1), atol=1e-4)
 
 
 def test_uniform_patches_have_no_duplicates():

@@ -42,9 +42,7 @@ def test_outputs_are_partitioned_and_equal_process_video(card, model, tmp_path):
     day = "tracks/date=2026-01-31"
     assert places == [f"{day}/camera=front", f"{day}/camera=front", f"{day}/camera=rear"]
     table = parquet.read_table(out / "tracks")
-    assert {"trip", "frame", "time_s", "track_id", "x1", "score", "distance_m", "camera", "date"} <= set(
-        table.column_names
-    )
+    assert {"trip", "frame", "time_s", "track_id", "x1", "score", "camera", "date"} <= set(table.column_names)
     expected = tmp_path / "expected.csv"
     single = card / "20260131_093000_F.mp4"
     with VehicleDetector(model, jobs=1) as detector, open_tracks(expected) as write:

@@ -199,8 +199,5 @@ def test_a_scheduler_that_does_not_answer(monkeypatch):
     with pytest.raises(InvalidInputError, match=message), open_dask("nonsense://127.0.0.1:9"):
         pass
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with (
-        pytest.raises(InvalidInputError, match=r"dask needs .*; pip install 'dask\[distributed\]'"),
-        open_dask("local"),
-    ):
+    with pytest.raises(InvalidInputError, match=r"dask needs .*; pip install"), open_dask("local"):
         pass

@@ -98,9 +98,7 @@ def test_a_killed_batch_with_workers_and_an_object_store(many, model, tmp_path, 
     before = {key: each["started"] for key, each in records(bucket / "results").items()}
     run(many, "loopback://results", model, tracks_only=True)
     found = check_whole(bucket / "results", done=TRIPS - 1, failed=1)
-    assert before.items() <= {key: each["started"] for key, each in found.items()}.items(), (
-        "a trip was done twice"
-    )
+    assert before.items() <= {key: each["started"] for key, each in found.items()}.items(), "done twice"
 
 
 def test_a_store_is_the_same_for_a_folder_and_a_url(tmp_path, bucket):

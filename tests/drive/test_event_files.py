@@ -27,9 +27,7 @@ def test_csv_and_json_hold_the_same(tmp_path):
     objects = json.loads(document.read_text())
     assert tuple(rows[0]) == tuple(objects[0]) == EVENT_COLUMNS
     assert [Event(**each) for each in objects] == EVENTS
-    assert [
-        {name: "" if value is None else str(value) for name, value in each.items()} for each in objects
-    ] == rows
+    assert [{k: "" if v is None else str(v) for k, v in each.items()} for each in objects] == rows
 
 
 @pytest.mark.parametrize(

@@ -73,10 +73,7 @@ class TestGpx:
 
     def test_stated_zones_may_differ(self, tmp_path):
         times = [
-            "2026-05-01T10:00:00+02:00",
-            "2026-05-01T08:00:01Z",
-            "2026-05-01T08:00:02",
-            "2026-05-01T09:00:03+01:00",
+            f"2026-05-01T{time}" for time in ("10:00:00+02:00", "08:00:01Z", "08:00:02", "09:00:03+01:00")
         ]
         points = [(50 + 20 * second / DEGREE_M, 10, time, "") for second, time in enumerate(times)]
         assert read_own_speed(write_gpx(tmp_path / "a.gpx", points)).at([0, 3]) == pytest.approx(20, rel=1e-3)

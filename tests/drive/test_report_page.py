@@ -216,14 +216,6 @@ class TestPage:
         assert len(data["tracks"]) == 100
         assert max(len(each["distance"]) for each in data["tracks"]) <= 21
 
-    def test_many_tracks_share_rows(self, tmp_path):
-        text = write_report(tmp_path, [[track(1 + index // 10)] for index in range(300)])
-        StrictParser(text)
-        bars = re.findall(r'<g class="bar c\d".*?</g>', text)
-        assert len(bars) == 30
-        assert len({y for bar in bars for y in re.findall(r' y="([\d.]+)"', bar)}) <= 2
-        assert all("show in the video" in bar for bar in bars)
-
 
 class TestSettingsAndModel:
     def test_of_a_classifier_of_patches(self, tmp_path):

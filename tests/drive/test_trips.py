@@ -187,9 +187,7 @@ def test_generated_trips_of_the_common_makers(tmp_path, form):
                 expected.append([])
         if not dated and broken and len(expected[-1]) == 1 and len(expected) > 1:
             continue  # without a time or a length, whether it follows is unknown
-        found = find_trips(
-            rng.permutation(np.array(list(lengths), object)).tolist(), duration=lengths.__getitem__
-        )
+        found = find_trips(rng.permutation([*lengths]).tolist(), duration=lengths.__getitem__)
         assert [list(trip.files) for trip in found] == expected
         assert {trip.camera for trip in found} == {MAKERS[form]}
 

@@ -93,9 +93,7 @@ def test_ignored_boxes_as_regions_only_remove_false_positives(trial, data):
     found, labels = trial
     ignore = np.array(data.draw(st.lists(st.booleans(), min_size=len(labels), max_size=len(labels))), bool)
     labels = TrackTable(labels["frame"], labels["track_id"], labels.boxes, ignore=ignore)
-    plain, lenient = (
-        evaluate_detections(found, labels, ignored_as_regions=option) for option in (False, True)
-    )
+    plain, lenient = (evaluate_detections(found, labels, ignored_as_regions=each) for each in (False, True))
     assert (lenient.tp, lenient.fn) == (plain.tp, plain.fn)
     assert lenient.fp + lenient.ignored == plain.fp + plain.ignored
     assert lenient.fp <= plain.fp

@@ -145,12 +145,10 @@ def test_terms_of_a_classifier_are_its_score():
 def test_a_detected_box_of_a_track_is_explained(detector, tmp_path, seconds, frame):
     # Without any detected box, the largest predicted one.
     table, box = TrackTable(), detector.detect(SCENE.image).boxes[0]
-    for index, time_since_update in enumerate(seconds):
+    for index, since in enumerate(seconds):
         write_image(tmp_path / f"{index}.png", SCENE.image)
         larger = box + index * np.array([-1, -1, 1, 1])
-        table.append(
-            index, index / 25, [SimpleNamespace(id=1, box=larger, time_since_update=time_since_update)]
-        )
+        table.append(index, index / 25, [SimpleNamespace(id=1, box=larger, time_since_update=since)])
     (picture,) = explain_tracks(detector, tmp_path, table)
     assert (picture.track, picture.frame) == (1, frame)
     assert picture.text.startswith("A vehicle is found here")

@@ -61,9 +61,7 @@ def test_consecutive_frames_differ_by_the_smallest_step():
     names = [side.renamed(lambda key: f"{3 * key}.png") for side in (found, labels)]
     assert evaluate_tracks(*names).jitter == 1
     # Names given in another order follow each other in that order: errors of 0, 0, 2, 2.
-    assert evaluate_tracks(*names, frames=[f"{3 * key}.png" for key in (0, 2, 1, 3)]).jitter == pytest.approx(
-        1 / 3
-    )
+    assert evaluate_tracks(*names, frames=["0.png", "6.png", "3.png", "9.png"]).jitter == pytest.approx(1 / 3)
 
 
 @pytest.mark.parametrize(
@@ -150,9 +148,7 @@ def test_hota_of_longer_clips_equals_that_of_trackeval(arguments, expected):
     # build with windows, which does not load on a server.
     found, labels = random_clip(*arguments)
     scores = evaluate_tracks(found, labels)
-    np.testing.assert_allclose(
-        [scores.hota, scores.deta, scores.assa, scores.loca], expected, rtol=0, atol=1e-9
-    )
+    np.testing.assert_allclose([scores.hota, scores.deta, scores.assa, scores.loca], expected, atol=1e-9)
 
 
 def test_hota_by_hand():

@@ -98,7 +98,7 @@ def test_yolo_of_cvat(tmp_path):
     for name, text in (
         ("obj.names", "person\r\ncar\r\n"),
         ("obj.data", "classes = 2"),
-        ("train.txt", "data/a.jpg"),
+        ("train.txt", "a.jpg"),
     ):
         (tmp_path / name).write_text(text)
     (folder / "frame_000000.txt").write_text("1 0.5 0.5 0.2 0.4\n0 0.5 0.5 0.1 0.1\n")

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
+from scipy.special import expit
 
 from tests.evaluation.cases import CAR, boxes_of, moved
 from vehicle_detection import DatasetError, InvalidInputError, TrackTable, read_labels, write_labels
@@ -133,9 +134,7 @@ def test_yolo_folders_hold_frames_and_confidences(tmp_path_factory, boxes):
     np.testing.assert_allclose(read.boxes, boxes.boxes, atol=0.1)
     if "score" in boxes.columns and len(boxes):
         assert read["track_id"].tolist() == boxes["track_id"].tolist()
-        np.testing.assert_allclose(
-            1 / (1 + np.exp(-read["score"])), 1 / (1 + np.exp(-boxes["score"])), atol=2e-6
-        )
+        np.testing.assert_allclose(expit(read["score"]), expit(boxes["score"]), atol=2e-6)
 
 
 @given(frame_boxes(file_names))
@@ -385,11 +384,10 @@ def test_invalid_arguments(tmp_path, monkeypatch, boxes, name, options, message)
 
 @pytest.mark.parametrize("kind", ["coco", "coco_results"])
 def test_frames_that_the_truth_does_not_have(tmp_path, kind):
-    write_labels(boxes_of((0, 1, CAR)), tmp_path / "truth.json")
+    truth = tmp_path / "truth.json"
+    write_labels(boxes_of((0, 1, CAR)), truth)
     with pytest.raises(InvalidInputError, match=r"labels hold frame 3, which is not an image of truth\.json"):
-        write_labels(
-            boxes_of((3, 1, CAR, 0.5)), tmp_path / "t.json", format=kind, truth=tmp_path / "truth.json"
-        )
+        write_labels(boxes_of((3, 1, CAR, 0.5)), tmp_path / "t.json", format=kind, truth=truth)
     with pytest.raises(DatasetError, match=r"none.json does not exist; check the path"):
         write_labels(boxes_of((0, 1, CAR, 0.5)), tmp_path / "t.json", truth=tmp_path / "none.json")
 

@@ -46,11 +46,7 @@ def own_network(seed=0, *, size=("height", "width"), weights=None, params=None, 
         helper.make_node("Sigmoid", ["logits"], ["p"]),
         helper.make_node("Concat", ["xy", "wh", "p"], ["boxes"], axis=1),
     ]
-    header = {
-        "format_version": version,
-        "params": PARAMS if params is None else params,
-        "metadata": {"frames": 12},
-    }
+    header = {"format_version": version, "params": params or PARAMS, "metadata": {"frames": 12}}
     initializers = [
         ("gray", np.float32(115)),
         ("factor", np.float32(1 / 64)),

@@ -53,9 +53,7 @@ def quick(monkeypatch, exported):
     """Few rendered frames, small samples, and the file of one network, as exporting takes seconds."""
     small = functools.partial(NetworkTraining, batch=2, size=(96, 64), warm_up=1)
     monkeypatch.setattr(train_default, "NetworkTraining", small)
-    monkeypatch.setattr(
-        train_default, "rendered_source", lambda **options: rendered_source(frames=1, **options)
-    )
+    monkeypatch.setattr(train_default, "rendered_source", functools.partial(rendered_source, frames=1))
     monkeypatch.setattr(
         train_default, "export_network", lambda network, frames, *facts: set_metadata(exported, *facts)
     )

@@ -60,9 +60,7 @@ def test_an_approaching_vehicle_contributes_more_than_one_at_constant_distance()
 
 
 def test_moving_vehicles_of_other_widths_determine_the_horizon():
-    cars = [
-        [on_road(50 - 0.35 * step, width=1.6), on_road(20 + 0.3 * step, width=2.1)] for step in range(100)
-    ]
+    cars = [[on_road(50 - 0.35 * step, width=1.6), on_road(20 + 0.3 * step, width=2.1)] for step in range(99)]
     assert error(estimated(cars)) < 5
 
 
@@ -147,10 +145,7 @@ def least_squares(camera, boxes, seconds):
     measured = width
     width = measured / (1 + camera.overhang_m * measured / (camera.focal_px * camera.vehicle_width_m))
     rows = np.hstack([np.ones((count, 1)), width[:, None], np.diag(width)])
-    bottom_std, pitch_std = (
-        camera.bottom_std_px * camera.pixel_scale,
-        camera.pitch_std_px * camera.pixel_scale,
-    )
+    bottom_std, pitch_std = np.array([camera.bottom_std_px, camera.pitch_std_px]) * camera.pixel_scale
     variance = bottom_std**2 + (camera.box_std * height) ** 2 + pitch_std**2
     variance += 2 * slope**2 * (bottom_std**2 + (camera.box_std * measured) ** 2)
     # The errors are correlated over half a second.

@@ -127,9 +127,7 @@ class TestSmoothing:
     def test_a_lane_change_after_a_long_straight_is_tracked(self):
         steps = play({"car": lambda t: on_road(15, x=3.6 / (1 + np.exp(-4 * (t - 6))))}, 9, noise=0.02)
         errors = [
-            np.abs(tracks[0].box[[0, 2]] - truth["car"][[0, 2]]).max()
-            for time, truth, tracks in steps
-            if 5 < time < 7
+            np.abs(tracks[0].box - truth["car"])[[0, 2]].max() for t, truth, tracks in steps if 5 < t < 7
         ]
         assert max(errors) < 25
 
@@ -651,10 +649,7 @@ class TestDistance:
     @pytest.mark.parametrize("seed", range(3))
     def test_the_horizon_of_an_unknown_camera_is_estimated(self, seed):
         """The initial guess is wrong by 43 px, which changes a distance of 30 m to 50 m or 22 m."""
-        scene = {
-            "near": lambda t: on_road(14 + 2 * t),
-            "far": lambda t: on_road(45 - 3 * t, x=3.6, length=4.4),
-        }
+        scene = {"near": lambda t: on_road(14 + 2 * t), "far": lambda t: on_road(45 - 3 * t, x=3.6, length=4)}
         wrong = Camera.for_frame(SHAPE, horizon=0.5, horizon_std_px=43.0)
         steps = play(scene, 6, seed=seed, noise=0.04, camera=wrong)
         for name, distance in (("near", 26.0), ("far", 27.0)):

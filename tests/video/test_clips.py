@@ -5,12 +5,10 @@ import pytest
 from moviepy import (
     AudioClip,
     ColorClip,
-    CompositeVideoClip,
     ImageClip,
     ImageSequenceClip,
     VideoClip,
     VideoFileClip,
-    clips_array,
     concatenate_videoclips,
     vfx,
 )
@@ -182,14 +180,6 @@ def test_clips_are_concatenated(method, expected):
     one = Recorder(clip_of()).clip
     both = concatenate_videoclips([one.subclipped(0, 0.4), one.subclipped(0.4, 0.8)], method=method)
     assert_same(pictures(both), expected)
-
-
-def test_clips_are_shown_side_by_side(expected):
-    detector = detector_from(find_red)
-    row = clips_array([[annotate_clip(clip_of(), detector), annotate_clip(clip_of(), detector)]])
-    assert_same(pictures(row), [np.concatenate([picture, picture], axis=1) for picture in expected])
-    composed = CompositeVideoClip([annotate_clip(clip_of(), detector), ImageClip(expected[0][:9, :9])])
-    assert composed.get_frame(0).shape == (*SHAPE, 3)
 
 
 def test_clips_without_a_frame_rate():

@@ -127,11 +127,7 @@ def test_the_ffmpeg_of_moviepy_is_used_without_importing_it(monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: f"/found/{name}")
     monkeypatch.delenv("FFMPEG_BINARY", raising=False)
     assert ffmpeg_binary() == get_ffmpeg_exe()
-    cases = {
-        "ffmpeg-imageio": get_ffmpeg_exe(),
-        "/some/ffmpeg": "/some/ffmpeg",
-        "auto-detect": "/found/ffmpeg",
-    }
+    cases = {"ffmpeg-imageio": get_ffmpeg_exe(), "/own/ffmpeg": "/own/ffmpeg", "auto-detect": "/found/ffmpeg"}
     for variable, expected in cases.items():
         monkeypatch.setenv("FFMPEG_BINARY", variable)
         assert ffmpeg_binary() == expected

@@ -281,9 +281,7 @@ def test_a_video_is_searched_twelve_times_a_second(tmp_path, fps, interval):
 def test_the_first_frame_of_a_scene_is_searched(tmp_path):
     # Two scenes, each with a pattern of its own.
     patterns = {level: np.random.default_rng(level).permutation([-15, 15] * 24) for level in (20, 200)}
-    scenes = {
-        level: (level + each.reshape(6, 8, 1)).repeat(8, 0).repeat(8, 1) for level, each in patterns.items()
-    }
+    scenes = {n: (n + each.reshape(6, 8, 1)).repeat(8, 0).repeat(8, 1) for n, each in patterns.items()}
     levels = [20] * 4 + [200] * 3 + [20] * 4
     frames = [scenes[level].repeat(3, axis=2).astype(np.uint8) for level in levels]
     detector = IntervalStub()

@@ -37,9 +37,7 @@ def test_a_complete_video_keeps_frames_rate_and_sound(clip, tmp_path):
     info = probe_video(target)
     assert (info.fps, info.frames, info.shape) == (NTSC, 20, (48, 64, 3))
     facts = ffmpeg_log(target)
-    assert re.search(r"Video: h264.*yuv420p\(tv, smpte170m/bt709/bt709, .*29\.97 fps, 29\.97 tbr", facts), (
-        facts
-    )
+    assert re.search(r"Video: h264.*yuv420p\(tv, smpte170m/bt709/bt709, .*29\.97 fps, 29\.97 tbr", facts)
     sound = [ffmpeg("-i", path, "-map", "0:a", "-c", "copy", "-f", "md5", "-") for path in (clip, target)]
     assert sound[0] == sound[1]
     data = target.read_bytes()
@@ -113,9 +111,7 @@ def test_progress_is_logged_in_intervals(clip, monkeypatch, caplog):
 
 
 def test_a_report_without_frames():
-    report = VideoReport(
-        frames=0, fps=Fraction(25), shape=(2, 2, 3), seconds=0.0, stages={"draw": 0.0}, tracks=1
-    )
+    report = VideoReport(frames=0, fps=Fraction(25), shape=(2, 2, 3), seconds=0, stages={"draw": 0}, tracks=1)
     assert report.stage_fractions == {"draw": 0.0}
     assert "1 vehicle" in str(report)
 
