@@ -178,6 +178,13 @@ def test_signed_urls_are_the_same_files_when_they_are_signed_again(signed, model
         assert b"cd34" not in path.read_bytes()
 
 
+def test_two_urls_of_one_file_are_processed_once(signed, model, tmp_path):
+    urls = [signed.url(name, "ab12") for name in ("093000", "081500")]
+    urls.append(f"{urls[0]}&X-Amz-Expires=60")
+    assert counts(run(urls, tmp_path / "out", model, tracks_only=True, group="file")) == (2, 0, 0, 1)
+    check_whole(tmp_path / "out", done=2, failed=0)
+
+
 def test_a_bad_segment_of_a_server_is_named(signed, model, tmp_path):
     signed.files["cam/20260131_081501_F.mp4"] = b"\0" * 3000
     urls = [signed.url(name, "ab12") for name in ("081500", "081501")]

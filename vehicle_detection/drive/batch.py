@@ -380,7 +380,7 @@ def _run(
 ) -> Generator[dict[str, Any]]:
     """Yield the record of each trip; closing it cancels those that have not begun."""
     attempts: Counter[str] = Counter()
-    left = {task["key"]: task for task in pending}
+    left = {id(task): task for task in pending}  # two URLs of one file give the same key
     waiting, busy = list(pending), list[dict[str, Any]]()  # to be submitted; processed by other runs
     running: dict[Future[Any], dict[str, Any]] = {}
     finished: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
@@ -404,7 +404,7 @@ def _run(
             elif record["status"] == BUSY:
                 busy.append(task)
             else:
-                del left[task["key"]]
+                del left[id(task)]
                 yield record
     except BrokenExecutor as error:  # such as a scheduler that was killed: the next run does the rest
         for task in left.values():
