@@ -5,6 +5,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from tests.notebook.helpers import gray_image, texts, titles
+from vehicle_detection.drawing import draw_cell_shares
 from vehicle_detection.evaluation import Explanation
 from vehicle_detection.notebook import plot_explanation
 
@@ -20,10 +21,8 @@ def explanation(**options):
 def test_cells_and_terms_are_drawn():
     figure = plot_explanation(gray_image(), explanation())
     assert titles(figure) == ["score 1.25", "share of each cell, orange: for a vehicle", "margin 0.45"]
-    overlay = figure.axes[1].images[1]
-    assert overlay.get_extent() == [10, 70, 60, 20]
-    alpha = overlay.get_array()[..., 3]
-    assert np.allclose(alpha, 0.75 * np.abs(CELLS))
+    shown = figure.axes[1].images[0].get_array()
+    np.testing.assert_array_equal(shown, draw_cell_shares(gray_image(), [10, 20, 70, 60], CELLS))
     bars = figure.axes[2].patches
     assert [bar.get_x() for bar in bars] == pytest.approx([0, 0.75, 0.25])
     assert [bar.get_width() for bar in bars] == pytest.approx([0.75, -0.5, 0.2])

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check, describe
+from vehicle_detection.drawing import draw_cell_shares
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import Explanation
 from vehicle_detection.features import (
@@ -31,9 +32,8 @@ if TYPE_CHECKING:
 # Thin lines for glyphs of more cells per row than this.
 _MANY_CELLS = 24
 
-# Part of the image around an explained window, as a fraction of the window's longer side, and opacity of the
-# cell with the largest share.
-_AROUND, _MAX_ALPHA = 0.25, 0.75
+# Part of the image around an explained window, as a fraction of the window's longer side.
+_AROUND = 0.25
 
 _CHANNEL_NAMES = {"YCrCb": ("Y", "Cr", "Cb"), "LAB": ("L", "a", "b")}
 
@@ -250,8 +250,6 @@ def plot_explanation(
     >>> [panel.get_title() for panel in figure.axes][:2]
     ['not found', 'share of each cell, orange: for a vehicle']
     """
-    from matplotlib.colors import to_rgb
-
     height, width = check.image(image).shape[:2]
     check.instance(explanation, "explanation", Explanation, "pass what explain returned")
     figure, grid = style.new_panels(figure, (10.5, 3.6), 1, 3)
@@ -261,18 +259,13 @@ def plot_explanation(
     both = explanation.window, explanation.box
     first, last = np.minimum(*both), np.maximum(*both)
     around = _AROUND * max(right - left, bottom - top)
-    for panel, title in ((plain, score), (shares, "share of each cell, orange: for a vehicle")):
-        style.add_image(panel, image, title)
+    drawn = draw_cell_shares(image, explanation.window, explanation.cells)
+    shares_title = "share of each cell, orange: for a vehicle"
+    for panel, shown, title in ((plain, image, score), (shares, drawn, shares_title)):
+        style.add_image(panel, shown, title)
         style.add_boxes(panel, explanation.box[None], style.YELLOW)
         panel.set_xlim(max(first[0] - around, -0.5), min(last[2] + around, width - 0.5))
         panel.set_ylim(min(last[3] + around, height - 0.5), max(first[1] - around, -0.5))
-    peak = float(np.abs(explanation.cells).max()) or 1.0
-    colors = np.empty((*explanation.cells.shape, 4))
-    colors[..., :3] = np.where(explanation.cells[..., None] > 0, to_rgb(style.VERMILION), to_rgb(style.BLUE))
-    colors[..., 3] = _MAX_ALPHA * np.abs(explanation.cells) / peak
-    limits = shares.get_xlim(), shares.get_ylim()
-    shares.imshow(colors, extent=(left, right, bottom, top), interpolation="nearest", zorder=2)
-    shares.set(xlim=limits[0], ylim=limits[1])
     names, values = list(explanation.terms), list(explanation.terms.values())
     ends = np.concatenate(([0.0], np.cumsum(values)))
     starts = ends[:-1]
