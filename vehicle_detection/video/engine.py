@@ -147,14 +147,17 @@ class _QueuedFrame:
     dropped: int = 0  # frames that a live source dropped before this one
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Plan:
-    """What `track` is to do.
+@dataclass(eq=False, kw_only=True)
+class _Pipeline:
+    """Decodes in a thread, searches in a pool, and tracks in the calling thread.
 
     Searched are: every n-th frame (`interval`), the first of each scene, and the first after dropped frames.
     The frames between wait for the next searched frame, and get interpolated tracks. With a `delay` above 0,
     that many searched frames are held back, because a track that is confirmed later is shown in them, too. Up
     to `lookahead` frames are decoded ahead.
+
+    The decoding thread also starts and ends the reader: Python raises KeyboardInterrupt in the main thread,
+    where it must not interrupt the start of a process. The first error stops everything.
     """
 
     source: FrameSource
@@ -168,24 +171,15 @@ class _Plan:
     frames: bool  # whether the results hold their frames
     reduction: int  # factor by which frames are reduced before the search
 
-
-class _Pipeline:
-    """Decodes in a thread, searches in a pool, and tracks in the calling thread.
-
-    The decoding thread also starts and ends the reader: Python raises KeyboardInterrupt in the main thread,
-    where it must not interrupt the start of a process. The first error stops everything.
-    """
-
-    def __init__(self, plan: _Plan) -> None:
-        self._plan, self._detector, self.jobs = plan, plan.detector, plan.jobs
+    def __post_init__(self) -> None:
         self.stages: defaultdict[str, float] = defaultdict(float)
         self.waiting: dict[str, float] = {}
         self.searching = 0.0  # elapsed seconds of all searches
         self.decoding = 0.0  # processor time of the decoding thread
         self.dropped = 0  # frames that a live source dropped
         self.damage = ""  # what is damaged in the source; known after the last frame
-        self._queue: ClosableQueue[_QueuedFrame] = ClosableQueue(plan.lookahead)
-        self._pool = ThreadPoolExecutor(plan.jobs, thread_name_prefix="vehicle-search")
+        self._queue: ClosableQueue[_QueuedFrame] = ClosableQueue(self.lookahead)
+        self._pool = ThreadPoolExecutor(self.jobs, thread_name_prefix="vehicle-search")
         self._reader: Reader | None = None
         self._lock = threading.Lock()
         self._aborted = self.stopped = False
@@ -221,7 +215,7 @@ class _Pipeline:
         error: BaseException | None = None
         started = time.perf_counter()
         try:
-            with self._plan.source.read(self._plan.first, self._plan.count) as reader:
+            with self.source.read(self.first, self.count) as reader:
                 with self._lock:
                     if self._aborted:
                         return
@@ -244,51 +238,51 @@ class _Pipeline:
     def _decode(self, reader: Reader) -> None:
         """Submit the frames to search to the pool, and queue all of them in order."""
         cuts, skipped, expected = SceneCuts(), 0, None
-        running: deque[Future[Any]] = deque(maxlen=self._plan.jobs)  # the last searches
-        sample = SceneCuts.sample_size(self._plan.source.info.shape)
+        running: deque[Future[Any]] = deque(maxlen=self.jobs)  # the last searches
+        sample = SceneCuts.sample_size(self.source.info.shape)
         for index, moment, frame in reader.decoded():
             if self.stopped:
                 break
-            cut = cuts.update(frame.sampled(sample)) or index in self._plan.source.breaks
+            cut = cuts.update(frame.sampled(sample)) or index in self.source.breaks
             skipped += 1
             dropped = index - expected if expected is not None else 0
             search = None
-            if expected is None or dropped or cut or skipped >= self._plan.interval:
-                if self._plan.reduction == 1:  # once for the search and for drawing
+            if expected is None or dropped or cut or skipped >= self.interval:
+                if self.reduction == 1:  # once for the search and for drawing
                     frame = DecodedFrame(frame.rgb())
                 search, skipped = self._pool.submit(self._search, frame), 0
                 running.append(search)
-            kept = frame if self._plan.frames else None
+            kept = frame if self.frames else None
             self._queue.put(_QueuedFrame(moment, kept, cut, search, dropped))
             del frame, kept
             self.dropped += dropped
             expected = index + 1
-            if self._plan.source.live and skipped + 1 >= self._plan.interval:
+            if self.source.live and skipped + 1 >= self.interval:
                 _wait_for_one(running)
 
     def _search(self, frame: DecodedFrame) -> tuple[Any, float]:
-        start, factor = time.perf_counter(), self._plan.reduction
+        start, factor = time.perf_counter(), self.reduction
         if factor == 1:
-            found = self._detector.search(frame.rgb())
+            found = self.detector.search(frame.rgb())
         else:
-            found = self._detector.search(frame.reduced(factor)).enlarged(factor)
+            found = self.detector.search(frame.reduced(factor)).enlarged(factor)
         return found, time.perf_counter() - start
 
     def _track_frames(self) -> Iterator[Any]:
         """Track the searched frames, and yield the results of all frames in their order."""
         block: list[_QueuedFrame] = []  # frames that are not searched, then one that is
         held: deque[tuple[list[_QueuedFrame], Any]] = deque()  # blocks with the results of searched frames
-        before, delay = None, self._plan.delay
+        before = None
         for item in self._queue:
             block.append(item)
             if item.search is None:
                 continue
             held.append((block, self._track(item, len(block))))
             block = []
-            if delay:
+            if self.delay:
                 results = backfill_results([result for _, result in held])
                 held = deque((items, result) for (items, _), result in zip(held, results, strict=True))
-            if len(held) > delay:
+            if len(held) > self.delay:
                 items, result = held.popleft()
                 yield from self._release(items, before, result)
                 before = result
@@ -304,7 +298,7 @@ class _Pipeline:
         except DetectorError as error:
             raise DetectorError(f"at {item.time:.2f} s: {error}") from error
         self.searching += seconds
-        return self._detector.track(found, time=item.time, frames=frames + item.dropped, cut=item.cut)
+        return self.detector.track(found, time=item.time, frames=frames + item.dropped, cut=item.cut)
 
     def _release(self, items: list[_QueuedFrame], before: Any, result: Any) -> Iterator[Any]:
         """Yield the results of a block: interpolated ones, and that of its searched frame.
@@ -314,7 +308,7 @@ class _Pipeline:
         results = [] if result is None else [result]
         times = [item.time for item in items[: len(items) - len(results)]]
         if times:
-            results = interpolate_results(before, result, times, self._plan.source.info.shape) + results
+            results = interpolate_results(before, result, times, self.source.info.shape) + results
         for item, each in zip(items, results, strict=True):
             for name, seconds in each.seconds.items():
                 if name != "search":  # measured here, because a detector may omit it
@@ -341,13 +335,13 @@ class TrackRun(Closing):
     """
 
     def __init__(
-        self, plan: _Plan, *, end: float | None, progress: bool, on_close: contextlib.ExitStack
+        self, pipeline: _Pipeline, *, end: float | None, progress: bool, on_close: contextlib.ExitStack
     ) -> None:
-        self.source, self.info, self.detector = plan.source, plan.source.info, plan.detector
-        self.has_frames, self._first, self._end, self._progress = plan.frames, plan.first, end, progress
-        self._total = plan.count or max(self.info.frames - plan.first, 0) or None
-        self._pipeline = _Pipeline(plan)
-        self._results = self._pipeline.run()
+        self.source, self.detector = pipeline.source, pipeline.detector
+        self.info, self.has_frames = self.source.info, pipeline.frames
+        self._end, self._progress = end, progress
+        self._total = pipeline.count or max(self.info.frames - pipeline.first, 0) or None
+        self._pipeline, self._results = pipeline, pipeline.run()
         # Detector and source; bar and threads. After the last result the source stays open for the sound.
         self._on_close, self._on_end = on_close, contextlib.ExitStack()
         self._entered = self.stopped = False
@@ -409,7 +403,7 @@ class TrackRun(Closing):
 
     def sound(self) -> AudioSource | None:
         """Return the sound of the frames; None if there is none."""
-        return self.source.audio(self._first, self._end)
+        return self.source.audio(self._pipeline.first, self._end)
 
     def report(self) -> VideoReport:
         """Return counts and times so far; the time of the run is complete once it is closed."""
@@ -517,7 +511,7 @@ def track(
         params = getattr(found, "track_params", None)
         reduction = getattr(found, "reduction", lambda shape: 1)(info.shape)
         ahead = min(jobs * interval, _LOOKAHEAD_BYTES // math.prod(info.shape))
-        plan = _Plan(
+        pipeline = _Pipeline(
             source=opened,
             detector=found,
             first=first,
@@ -530,7 +524,7 @@ def track(
             frames=frames,
             reduction=reduction,
         )
-        return TrackRun(plan, end=end, progress=progress, on_close=stack.pop_all())
+        return TrackRun(pipeline, end=end, progress=progress, on_close=stack.pop_all())
 
 
 def _processor_times() -> tuple[float, float]:
