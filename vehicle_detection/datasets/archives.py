@@ -8,7 +8,6 @@ import lzma
 import os
 import re
 import struct
-import time
 import zipfile
 import zlib
 from collections import Counter
@@ -33,11 +32,9 @@ from vehicle_detection._common import (
     resolve_jobs,
 )
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.images import decode_image
+from vehicle_detection.images import IMAGE_SUFFIXES, decode_image
 
 _LOGGER = logging.getLogger(__name__)
-
-_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
 
 COURSE_URL = "https://s3.amazonaws.com/udacity-sdc/Vehicle_Tracking/"
 # Number of patches in each folder. Mirrors repack the archives, so there is no hash of the whole file.
@@ -52,7 +49,6 @@ ARCHIVES: dict[str, dict[str, int]] = {
 CLASS_FOLDERS = {"vehicles": True, "cars": True, "nonvehicles": False, "notcars": False}
 # Maximum size of all unpacked members together; the course's have 60 MB each.
 _MAX_ARCHIVE_BYTES = 1_000_000_000
-STALE_SECONDS = 3600.0  # age from which a partial download counts as left behind by a killed process
 # Errors of zipfile on a damaged archive; RuntimeError if it is encrypted.
 _ZIP_ERRORS = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, RuntimeError, ValueError, OSError,
@@ -66,7 +62,7 @@ def parent_folder(name: str) -> str:
 
 def is_image(name: str) -> bool:
     """Whether a file name is that of an image that is not hidden."""
-    return name.lower().endswith(_IMAGE_SUFFIXES) and not is_hidden(name)
+    return name.lower().endswith((*IMAGE_SUFFIXES, ".ppm")) and not is_hidden(name)
 
 
 def open_archive(path: Path, shown: str | None = None) -> zipfile.ZipFile:
@@ -294,11 +290,6 @@ def _fetch(target: Path, address: str, counts: dict[str, int], progress: bool) -
         except DatasetError as error:
             _LOGGER.warning("the existing file is not the archive, downloading it again: %s", error)
     make_folder(target.parent, "folder")
-    for part in target.parent.glob(f".{target.stem}.*{target.suffix}"):
-        # Partial downloads of killed processes; a running download keeps its file's time recent.
-        with contextlib.suppress(OSError):
-            if time.time() - part.stat().st_mtime > STALE_SECONDS:
-                part.unlink()
     with atomic_write(target) as part:
         _LOGGER.info("downloading %s", address)
         _download(address, part, progress)
@@ -307,7 +298,7 @@ def _fetch(target: Path, address: str, counts: dict[str, int], progress: bool) -
 
 
 def _download(address: str, part: Path, progress: bool) -> None:
-    """Download `address` into the file `part`; every failure raises a DatasetError."""
+    """Download `address` into the file `part`; a failure of the network raises a DatasetError."""
     import pooch
     import requests
 
@@ -326,11 +317,6 @@ def _download(address: str, part: Path, progress: bool) -> None:
         raise DatasetError(
             f"{address} cannot be downloaded completely ({type(error).__name__}); check the network and url "
             f"and call again, or put the file from a browser into {part.parent}"
-        ) from error
-    except OSError as error:
-        raise DatasetError(
-            f"{address} cannot be stored in {part.parent}: {error.strerror}; free some space or choose "
-            "another folder"
         ) from error
     finally:
         # pooch leaves the connection open when it raises.

@@ -12,9 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check, describe, fields
+from vehicle_detection._common import check, fields
 from vehicle_detection.camera import Camera
-from vehicle_detection.errors import InvalidInputError
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -167,11 +166,8 @@ class SceneConfig:
 
 
 def _check_shape(shape: object, name: str) -> tuple[int, int]:
-    if not isinstance(shape, tuple) or len(shape) != 2:
-        raise InvalidInputError(f"{name} must be (height, width) in pixels, got {describe(shape)}")
-    height, width = (
-        check.integer(size, f"{name}[{axis}]", low=64, high=4320) for axis, size in enumerate(shape)
-    )
+    sides = enumerate(check.shape(shape))
+    height, width = (check.integer(size, f"{name}[{axis}]", low=64, high=4320) for axis, size in sides)
     return height, width
 
 
