@@ -556,7 +556,9 @@ def parse_number(cell: Any, name: str, place: str) -> float:
     try:
         if isinstance(cell, bool) or "_" in str(cell):  # Python reads 1_0 as 10
             raise ValueError
-        value: float = int(cell) if isinstance(cell, (int, np.integer)) else float(cell)
+        # A float would round ids above 2**53, and so join two tracks.
+        is_integer = isinstance(cell, (int, np.integer)) or str(cell).strip().isdecimal()
+        value: float = int(cell) if is_integer else float(cell)
         finite = math.isfinite(value)
     except (TypeError, ValueError, OverflowError):
         value, finite = math.nan, False

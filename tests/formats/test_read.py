@@ -9,7 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from vehicle_detection import DatasetError, InvalidInputError, TrackTable, read_labels, write_image
+from vehicle_detection import (
+    DatasetError,
+    InvalidInputError,
+    TrackTable,
+    read_labels,
+    write_image,
+    write_labels,
+)
 
 HEADER = "frame,track,x1,y1,x2,y2,occluded,truncated,ignore"
 
@@ -471,6 +478,14 @@ def test_numbers_that_only_python_reads(tmp_path):
     for name in ("a.jsonl", "a.json"):
         with pytest.raises(DatasetError, match="a number has too many digits"):
             read_labels(written(tmp_path, '{"frame": ' + "9" * 5000 + "}", name))
+
+
+@pytest.mark.parametrize("suffix", ["csv", "jsonl", "txt"])
+def test_tracks_with_large_ids_remain_distinct(tmp_path, suffix):
+    ids = [2**53, 2**53 + 1, 2**62]
+    boxes = [[100 * place, 0, 100 * place + 50, 40] for place in range(3)]
+    write_labels(TrackTable([0, 1, 2], ids, boxes), tmp_path / f"a.{suffix}")
+    assert read_labels(tmp_path / f"a.{suffix}")["track_id"].tolist() == ids
 
 
 def test_an_empty_column_of_scores_is_one_of_labels(tmp_path):
