@@ -43,88 +43,12 @@ _RECONNECT_DELAYS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 _STEADY_SECONDS = 10.0
 
 
-class _LiveProcess:
-    """An ffmpeg that decodes a stream to YUV4MPEG2, whose header states the frame size and the constant rate.
-
-    With `like`, frames get the size and rate of another process. With `timed`, a stream without data for
-    some seconds has ended.
-    """
-
-    def __init__(
-        self, name: str, options: Sequence[str], *, stdin: int, like: VideoInfo | None, timed: bool
-    ) -> None:
-        self.name, self._timed = name, timed
-        self._stalled = False
-        filters = (
-            f"{SQUARE_PIXELS},crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt601:out_range=tv"
-        )
-        rate: tuple[str, ...] = ()
-        if like is not None:
-            filters = f"scale={like.width}:{like.height}:out_color_matrix=bt601:out_range=tv"
-            rate = ("-r", str(like.fps))
-        output = ("-an", "-vf", filters, *rate, "-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe", "pipe:1")
-        # Level "info": its log states the format of the input.
-        self.process = Process(
-            ("-nostats", *pixel_limit(), *options, *output), level="info", stdin=stdin, stdout=True
-        )
-
-    def read_info(self) -> VideoInfo:
-        """Read the header of the stream."""
-        header = self._read_line(_OPEN_TIMEOUT)
-        size = re.match(rb"YUV4MPEG2 W(\d+) H(\d+) F(\d+):(\d+)", header)
-        if size is None:
-            if self._stalled:
-                raise TransientVideoError(
-                    f"{self.name} sends no video within {_OPEN_TIMEOUT:g} s; check the source"
-                )
-            code, log = self.process.wait(), self.process.log()
-            check_resources(self.name, code, log)
-            check_frame_size(self.name, log)
-            reason, remedy = last_line(log), "check the source"
-            if "received no packets" in reason and self.name == "-":
-                remedy = (
-                    "pass the file's path, because MP4 needs its index at the start to come through a pipe"
-                )
-            message = f"{self.name} is not a video that ffmpeg can read ({reason}); {remedy}"
-            raise video_error(message, self.name, code, log)
-        width, height, numerator, denominator = (int(number) for number in size.groups())
-        found = re.search(r"^Input #0, (\S+),", self.process.log(), re.MULTILINE)
-        return VideoInfo(
-            width=width,
-            height=height,
-            fps=Fraction(numerator, denominator or 1),
-            frames=0,
-            duration=0.0,
-            container=found[1] if found else "",
-        )
-
-    def read_planes(self, planes: NDArray[np.uint8]) -> bool:
-        """Read the next frame into `planes`; False at the end of the stream."""
-        if not self._read_line(NETWORK_TIMEOUT):
-            return False
-        return self.process.read_into(planes, lambda: self._has_data(NETWORK_TIMEOUT))
-
-    def _read_line(self, timeout: float) -> bytes:
-        """Read a line of a header; empty at the end of the stream."""
-        line = bytearray()
-        while not line.endswith(b"\n"):
-            byte = self.process.stdout.read(1) if line or self._has_data(timeout) else b""
-            if not byte or len(line) > _MAX_HEADER_BYTES:
-                return b""
-            line += byte
-        return bytes(line)
-
-    def _has_data(self, timeout: float) -> bool:
-        """Wait for data or the end of the pipe."""
-        self._stalled = self._timed and not self.process.has_data(timeout)
-        return not self._stalled
-
-
 class LiveStream(Reader):
     """Frames of a stream, which is opened at once and read once: in the range that `start` chooses.
 
-    With `reconnect`, a network stream that breaks off or stalls is opened again, some times in a row; missed
-    frames leave a gap in the numbers.
+    ffmpeg decodes it to YUV4MPEG2, whose header states the frame size and the constant rate. A network stream
+    without data for some seconds has ended. With `reconnect`, one that breaks off or stalls is opened again,
+    some times in a row; missed frames leave a gap in the numbers.
     """
 
     def __init__(
@@ -141,7 +65,8 @@ class LiveStream(Reader):
         self._attempts = 0
         self._lock = threading.Lock()
         self._killed = threading.Event()
-        self._process: _LiveProcess | None = None
+        self._process: Process | None = None
+        self._stalled = False  # whether the last wait for data was in vain
         self._number = -1  # of the last frame
         self.info = self._open(None)
         self._opened = self._last_read = time.monotonic()
@@ -198,16 +123,24 @@ class LiveStream(Reader):
             self._newest.finish(error)
 
     def _open(self, like: VideoInfo | None) -> VideoInfo:
-        """Start ffmpeg, in place of one that has ended."""
+        """Start ffmpeg, in place of one that has ended, with the frame size and rate of `like`."""
+        filters = (
+            f"{SQUARE_PIXELS},crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt601:out_range=tv"
+        )
+        rate: tuple[str, ...] = ()
+        if like is not None:
+            filters = f"scale={like.width}:{like.height}:out_color_matrix=bt601:out_range=tv"
+            rate = ("-r", str(like.fps))
+        output = ("-an", "-vf", filters, *rate, "-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe", "pipe:1")
+        # Level "info": its log states the format of the input.
+        options = ("-nostats", *pixel_limit(), *self._options, *output)
         with self._lock:
             if self._killed.is_set():
                 raise VideoError(f"{self.name} has been closed")
             self._end_process()
-            process = self._process = _LiveProcess(
-                self.name, self._options, stdin=self._stdin, like=like, timed=self._network
-            )
+            process = self._process = Process(options, level="info", stdin=self._stdin, stdout=True)
         try:
-            return process.read_info()
+            return self._read_info(process)
         except ValueError as error:  # closed by another thread
             raise VideoError(f"{self.name} has been closed") from error
         except BaseException:
@@ -217,9 +150,54 @@ class LiveStream(Reader):
 
     def _end_process(self) -> None:
         if self._process is not None:
-            self._process.process.close()
-            self.cpu_seconds += self._process.process.cpu_seconds
+            self._process.close()
+            self.cpu_seconds += self._process.cpu_seconds
             self._process = None
+
+    def _read_info(self, process: Process) -> VideoInfo:
+        """Read the header of the stream."""
+        header = self._read_line(process, _OPEN_TIMEOUT)
+        size = re.match(rb"YUV4MPEG2 W(\d+) H(\d+) F(\d+):(\d+)", header)
+        if size is None:
+            if self._stalled:
+                raise TransientVideoError(
+                    f"{self.name} sends no video within {_OPEN_TIMEOUT:g} s; check the source"
+                )
+            code, log = process.wait(), process.log()
+            check_resources(self.name, code, log)
+            check_frame_size(self.name, log)
+            reason, remedy = last_line(log), "check the source"
+            if "received no packets" in reason and self.name == "-":
+                remedy = (
+                    "pass the file's path, because MP4 needs its index at the start to come through a pipe"
+                )
+            message = f"{self.name} is not a video that ffmpeg can read ({reason}); {remedy}"
+            raise video_error(message, self.name, code, log)
+        width, height, numerator, denominator = (int(number) for number in size.groups())
+        found = re.search(r"^Input #0, (\S+),", process.log(), re.MULTILINE)
+        return VideoInfo(
+            width=width,
+            height=height,
+            fps=Fraction(numerator, denominator or 1),
+            frames=0,
+            duration=0.0,
+            container=found[1] if found else "",
+        )
+
+    def _read_line(self, process: Process, timeout: float) -> bytes:
+        """Read a line of a header; empty at the end of the stream."""
+        line = bytearray()
+        while not line.endswith(b"\n"):
+            byte = process.stdout.read(1) if line or self._has_data(process, timeout) else b""
+            if not byte or len(line) > _MAX_HEADER_BYTES:
+                return b""
+            line += byte
+        return bytes(line)
+
+    def _has_data(self, process: Process, timeout: float) -> bool:
+        """Wait for data or the end of the pipe."""
+        self._stalled = self._network and not process.has_data(timeout)
+        return not self._stalled
 
     def read(self, planes: NDArray[np.uint8]) -> int | None:
         """Read the next frame into `planes` and return its number from 0; None at the end."""
@@ -233,9 +211,12 @@ class LiveStream(Reader):
         return self._number
 
     def _read_planes(self, planes: NDArray[np.uint8]) -> bool:
+        """Read the next frame of a connection into `planes`; False at its end."""
         process = self._process
         try:
-            return process is not None and process.read_planes(planes)
+            if process is None or not self._read_line(process, NETWORK_TIMEOUT):
+                return False
+            return process.read_into(planes, lambda: self._has_data(process, NETWORK_TIMEOUT))
         except ValueError:  # closed by another thread
             return False
 
@@ -268,14 +249,14 @@ class LiveStream(Reader):
 
     def _reason(self) -> str:
         """Last message of ffmpeg."""
-        return last_line("" if self._process is None else self._process.process.log())
+        return last_line("" if self._process is None else self._process.log())
 
     def kill(self) -> None:
         """End ffmpeg at once, from any thread; a thread that reads sees the end."""
         self._killed.set()
         with self._lock:
             if self._process is not None:
-                self._process.process.kill()
+                self._process.kill()
         self._newest.abort()
 
     def close(self) -> None:
