@@ -64,35 +64,28 @@ def annotate_clip(
     every = check.integer(every, "every", low=1, high=1000)
     if on_result is not None and not callable(on_result):
         raise InvalidInputError(f"on_result must be a function of a result, got {describe(on_result)}")
-    fps = getattr(given, "fps", None)
-    annotated: Clip = given.transform(_ClipAnnotator(copy.copy(detector), fps, every, on_result))
-    return annotated
+    own, fps = copy.copy(detector), getattr(given, "fps", None)
+    last_time: float | None = None
+    count, picture = 0, np.empty(0, np.uint8)
 
-
-class _ClipAnnotator:
-    """The function of a moviepy clip that annotates its frames, with a detector of its own."""
-
-    def __init__(
-        self, detector: Any, fps: float | None, every: int, on_result: Callable[[FrameResult], object] | None
-    ) -> None:
-        self._detector, self._fps, self._every, self._on_result = detector, fps, every, on_result
-        self._time: float | None = None
-
-    def __call__(self, get_frame: Callable[[float], NDArray[np.uint8]], t: float) -> NDArray[np.uint8]:
+    def annotate(get_frame: Callable[[float], NDArray[np.uint8]], t: float) -> NDArray[np.uint8]:
         """Return the annotated frame at `t` seconds."""
+        nonlocal last_time, count, picture
         # Times within one frame, as in slow motion, show the same frame.
-        time = float(t) if not self._fps else int(t * self._fps + _FRAME_TOLERANCE) / self._fps
-        if time != self._time:
-            if self._time is None or time < self._time:
-                self._detector.reset(fps=self._fps or USUAL_FPS)
-                self._count = 0
+        time = float(t) if not fps else int(t * fps + _FRAME_TOLERANCE) / fps
+        if time != last_time:
+            if last_time is None or time < last_time:
+                own.reset(fps=fps or USUAL_FPS)
+                count = 0
             frame = get_frame(time)
             if frame.dtype != np.uint8:  # effects such as FadeIn return fractions of gray levels
                 frame = np.clip(frame, 0, 255).astype(np.uint8)
-            result = self._detector.process(frame, time, search=self._count % self._every == 0)
-            picture: NDArray[np.uint8] = self._detector.annotate(frame, result)
-            self._picture, self._time = picture, time
-            self._count += 1
-            if self._on_result is not None:
-                self._on_result(result)
-        return self._picture.copy()
+            result = own.process(frame, time, search=count % every == 0)
+            picture, last_time = own.annotate(frame, result), time
+            count += 1
+            if on_result is not None:
+                on_result(result)
+        return picture.copy()
+
+    annotated: Clip = given.transform(annotate)
+    return annotated
