@@ -4,6 +4,7 @@ from .calibration import calibration_error as calibration_error
 from .detections import DetectionScores as DetectionScores
 from .detections import best_f1 as best_f1
 from .detections import evaluate_detections as evaluate_detections
+from .detections import mean as mean
 from .detections import precision_recall_curve as precision_recall_curve
 from .distances import DistanceScores as DistanceScores
 from .distances import evaluate_distances as evaluate_distances

@@ -213,8 +213,7 @@ def _explain_classifier(
     near = np.flatnonzero(overlaps >= _MIN_WINDOW_IOU)
     found = bool(len(near))
     window = windows.boxes[near[np.argmax(windows.scores[near])]].astype(np.float64) if found else box
-    height, width = image.shape[:2]
-    x1, y1, x2, y2 = np.rint(np.clip(window, 0, [width, height, width, height])).astype(int).tolist()
+    x1, y1, x2, y2 = np.rint(clip_boxes(window[None], image.shape)[0]).astype(int).tolist()
     x2, y2 = max(x2, x1 + 1), max(y2, y1 + 1)
     patch = cv2.resize(image[y1:y2, x1:x2], (PATCH_SIZE, PATCH_SIZE))
     features = extract_features(patch[None], model.params)[0].astype(np.float64)

@@ -24,6 +24,7 @@ from vehicle_detection.evaluation import (
     calibration_error,
     evaluate_detections,
     match_detections,
+    mean,
     precision_recall_curve,
 )
 from vehicle_detection.tables import FrameKey, TrackTable
@@ -199,7 +200,7 @@ def score_fold(
     above = fold.logits >= threshold
     found = fold.matches.match[above]
     groups = fold.groups
-    recalls: dict[str, Any] = {f"recall_{name}": _mean(np.isin(rows, found)) for name, rows in groups.items()}
+    recalls: dict[str, Any] = {f"recall_{name}": mean(np.isin(rows, found)) for name, rows in groups.items()}
     at_threshold = {name: getattr(scores, name) for name in ("f1", "precision", "recall", "mean_iou")}
     return FoldScore(
         name=fold.frames.name,
@@ -221,10 +222,6 @@ def score_fold(
     )
 
 
-def _mean(values: Sequence[int] | NDArray[Any]) -> float:
-    return float(np.mean(values)) if len(values) else math.nan
-
-
 def _false_without_vehicles(fold: FoldDetections, above: NDArray[np.bool_]) -> dict[str, Any]:
     """Count the false boxes `above` the threshold, per frame without a label and without a scored one."""
     labels, false = fold.labels, above & (fold.matches.match < 0) & ~fold.matches.ignored
@@ -232,7 +229,7 @@ def _false_without_vehicles(fold: FoldDetections, above: NDArray[np.bool_]) -> d
     scored = {labels["frame"][row] for row in fold.matches.usable.tolist()}
     empty = [counts[key] for key in fold.frames.keys if not len(labels.rows(key))]
     vehicle_free = [counts[key] for key in fold.frames.keys if key not in scored]
-    return {"false_per_empty_frame": _mean(empty), "false_per_vehicle_free_frame": _mean(vehicle_free)}
+    return {"false_per_empty_frame": mean(empty), "false_per_vehicle_free_frame": mean(vehicle_free)}
 
 
 def best_threshold(folds: Sequence[FoldDetections]) -> float:
