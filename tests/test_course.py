@@ -307,20 +307,19 @@ def test_window_hits_equal_the_definition(models, dtype, name):
 
 
 @pytest.mark.parametrize(
-    ("clf", "scaler"),
+    ("clf", "scaler", "labels"),
     [
-        (GaussianNB(), StandardScaler()),
-        (DecisionTreeClassifier(random_state=0), StandardScaler()),
-        (SVC(), StandardScaler()),
-        (SVC(kernel="linear"), StandardScaler()),
-        (LogisticRegression(max_iter=1000), StandardScaler()),
-        (SGDClassifier(random_state=0, max_iter=5, tol=None), StandardScaler(with_mean=False)),
-        (LinearSVC(random_state=0), MinMaxScaler()),
-        (LinearSVC(random_state=0), RobustScaler()),
+        (GaussianNB(), StandardScaler(), (0, 1)),
+        (DecisionTreeClassifier(random_state=0), StandardScaler(), (-1, 1)),
+        (SVC(), StandardScaler(), (1, 2)),
+        (SVC(kernel="linear"), StandardScaler(), (0, 1)),
+        (LogisticRegression(max_iter=1000), StandardScaler(), (-1, 1)),
+        (SGDClassifier(random_state=0, max_iter=5, tol=None), StandardScaler(with_mean=False), (1, 2)),
+        (LinearSVC(random_state=0), MinMaxScaler(), (-1, 1)),
+        (LinearSVC(random_state=0), RobustScaler(), (1, 2)),
     ],
-    ids=lambda estimator: type(estimator).__name__,
+    ids=lambda each: type(each).__name__,
 )
-@pytest.mark.parametrize("labels", [(0, 1), (-1, 1), (1, 2)])
 def test_any_classifier_of_scikit_learn(models, clf, scaler, labels):
     case = models["all", "uint8"]
     model = trained(case.X, np.where(LABELS, labels[1], labels[0]), clf, scaler)

@@ -294,10 +294,7 @@ GOOD = frame_with(CAR)
 
 @pytest.mark.parametrize(
     ("frame", "message"),
-    [
-        (GOOD[..., 0], "COLOR_GRAY2RGB"),
-        (np.dstack([GOOD, GOOD[..., 0]]), "drop the alpha channel"),
-    ],
+    [(GOOD[..., 0], "COLOR_GRAY2RGB"), (np.dstack([GOOD, GOOD[..., 0]]), "drop the alpha channel")],
 )
 def test_bad_frames_are_refused_and_change_nothing(frame, message):
     detector, plain = make(), make()
@@ -418,15 +415,6 @@ def test_a_copy_continues_the_tracks(copied, regions):
     for frame in frames[6:]:
         expected, found = detector.process(frame), copy_of_it.process(frame)
         assert [str(each) for each in found.tracks] == [str(each) for each in expected.tracks]
-
-
-def test_short_descriptions():
-    detector = make()
-    result = detector.process(frame_with(), 0.0)
-    assert repr(detector) == f"VehicleDetector({detector.model!r}, 1 frame processed)"
-    assert repr(result) == "FrameResult(0 at 0.00 s: 0 detections, 0 vehicles shown)"
-    assert len(repr(load_model("highway"))) < 100
-    assert len(repr(detector.search(frame_with()))) < 200
 
 
 def test_a_second_thread_is_refused():

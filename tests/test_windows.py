@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import random_classifier
-from tests.search_reference import score_windows
-from vehicle_detection import FeatureParams, InvalidInputError, SearchParams, course, single_img_features
+from vehicle_detection import FeatureParams, InvalidInputError, SearchParams, course
 from vehicle_detection.windows import band_windows, search_windows, slide_window
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
@@ -120,24 +119,6 @@ def test_windows_above_the_minimum_score_are_returned():
     np.testing.assert_array_equal(default.boxes, windows[every.scores > 0])
     none = search_windows(IMAGE, slide_window(image_of(64, 63)), CLASSIFIER, min_score=None)
     assert none.boxes.shape == (0, 4)
-
-
-def test_both_borders_differ_only_in_the_gradients():
-    params = FeatureParams(pix_per_cell=8, hog_channel="ALL", spatial_size=16)
-    classifier = random_classifier(params)
-    image = image_of(64, 64, 5)
-    # The image is one window, so both borders coincide.
-    window = [[0, 0, 64, 64]]
-    own = search_windows(image, window, classifier, min_score=None)
-    shared = score_windows(image, window, classifier)
-    np.testing.assert_allclose(shared, own.scores, atol=1e-5)
-    features = single_img_features(image, params)
-    np.testing.assert_allclose(own.scores, classifier.decision_function(features[None]), atol=1e-5)
-    wide = image_of(80, 96, 5)
-    window = [[16, 8, 80, 72]]
-    own = search_windows(wide, window, classifier, min_score=None)
-    shared = score_windows(wide, window, classifier)
-    assert np.abs(own.scores - shared).max() > 1e-4
 
 
 @pytest.mark.parametrize(

@@ -15,15 +15,7 @@ import numba
 import numpy as np
 import pytest
 
-from tests.cli.commands import (
-    contents,
-    finish,
-    patches_of,
-    refuse,
-    run,
-    start_changed,
-    write_patches,
-)
+from tests.cli.commands import contents, finish, patches_of, refuse, run, start_changed, write_patches
 from tests.helpers import ROOT, failing, wait_until
 from tests.video.clips import gray_frames, write_clip
 from vehicle_detection import detector, render_scene, write_image
@@ -240,14 +232,6 @@ def test_a_current_folder_that_has_been_removed(clip, tmp_path):
 
 
 # --- arguments and environment ---
-
-
-@pytest.mark.parametrize(
-    "option", [["--model", "/dev/zero"], ["--tracks", "/dev/full/x.csv"], ["--model", "a" * 5000]]
-)
-def test_devices_as_arguments(clip, tmp_path, option):
-    refuse("video", clip, "-o", tmp_path / "out.mp4", *option)
-    assert contents(tmp_path) == []
 
 
 @pytest.mark.parametrize(

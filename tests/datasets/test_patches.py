@@ -115,12 +115,6 @@ def test_a_zip_and_the_folder_it_unpacks_to_are_the_same_set(vehicles_zip, tmp_p
     assert from_zip.fingerprint == from_folder.fingerprint
 
 
-@pytest.mark.parametrize("jobs", [1, 2, 7])
-def test_the_number_of_threads_does_not_matter(vehicles_zip, jobs):
-    patches = load_patches(vehicles_zip, jobs=jobs)
-    np.testing.assert_array_equal(patches.patches, load_patches(vehicles_zip).patches)
-
-
 def test_the_folder_may_be_the_working_folder(vehicles_zip, tmp_path, monkeypatch):
     monkeypatch.chdir(unpack(vehicles_zip, tmp_path / "out") / "vehicles")
     assert load_patches(".").names == IN_ORDER

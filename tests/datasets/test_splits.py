@@ -145,14 +145,6 @@ def test_equal_patches_are_duplicates_at_the_largest_threshold():
     assert split_leakage(both, Split(range(50), range(50, 100)), threshold=1) == 1
 
 
-def test_groups_are_found_across_chunks():
-    seeds = [*range(1098), 3, 700]
-    split = split_groups(copies_of(seeds), test_size=0.5)
-    sides = {row: side for side, rows in enumerate(split) for row in rows.tolist()}
-    assert (sides[1098], sides[1099]) == (sides[3], sides[700])
-    assert len(split.test) == 550
-
-
 SEED, EACH, SAME = {"random_state": 0}, set_of([(folder, 1) for folder in FOLDERS]), copies_of([1] * 10)
 
 

@@ -302,21 +302,6 @@ def test_a_missing_pyarrow_is_reported_before_the_first_trip(card, model, tmp_pa
     assert not (tmp_path / "out").exists()
 
 
-def test_the_status_sums_up_the_records(tmp_path):
-    folder = tmp_path / "records"
-    folder.mkdir()
-    source = {"uri": "/cards/1/20260131_081500_F.mp4", "size": 60_000_000, "tag": "1769847300000000000"}
-    record = {"status": "done", "frames": 1500, "tracks": 7, "video_seconds": 60.0, "seconds": 30.0,
-              "sources": [source] * 10, "settings": {"model": "default", "options": {}}}  # fmt: skip
-    text = json.dumps(record, indent=1)
-    for number in range(100):
-        (folder / f"{number:012x}-0123456789ab.json").write_text(text)
-    (folder / "a-b.json").write_text('{"status": "failed"}')  # damaged
-    status = batch_status(tmp_path)
-    assert (status.done, status.failed, status.frames, status.tracks) == (100, 0, 150_000, 700)
-    assert "1.7 hours of video" in str(status)
-
-
 def test_annotated_videos_are_no_sources(card, model, tmp_path):
     """Also those of another batch, and by another path."""
     options = {"options": {"every": 10}}
@@ -437,15 +422,6 @@ def test_an_error_cancels_trips_that_have_not_begun(many, model, tmp_path):
         ended.set()
     assert len(began) <= 2
     assert all(call.cancelled() for call in calls[2:])
-
-
-def test_a_summary_must_not_replace_a_source(card, model, tmp_path):
-    source = card / "20260131_093000_F.mp4"
-    before = source.read_bytes()
-    words = ["batch", "-o", str(tmp_path / "out"), "--tracks-only", "--summary", str(source), str(card)]
-    result = CliRunner().invoke(app, words)
-    assert (result.exit_code, source.read_bytes()) == (2, before)
-    assert "--summary must end in .csv" in result.stderr
 
 
 @pytest.mark.usefixtures("in_process")

@@ -245,11 +245,7 @@ class TestSettingsAndModel:
 
     @pytest.mark.parametrize(
         "metadata",
-        [
-            {},
-            {"note": "<i>mine</i>", "data": {"sources": {"own": 3}}, "metrics": 0.5},
-            {"data": "own"},
-        ],
+        [{}, {"note": "<i>mine</i>", "data": {"sources": {"own": 3}}, "metrics": 0.5}, {"data": "own"}],
     )
     @pytest.mark.parametrize("load", [load_classifier, load_model])
     def test_metadata_may_hold_anything(self, tmp_path, load, metadata):

@@ -143,13 +143,6 @@ def test_results_tables_and_streams_give_the_same_file(tmp_path, name):
     assert (tmp_path / "named").read_bytes() == whole
 
 
-def test_mot_counts_from_one(tmp_path):
-    write_tracks(RESULTS, tmp_path / "t.txt")
-    lines = (tmp_path / "t.txt").read_text().splitlines()
-    assert lines[0] == "1,1,11.0,21.0,40.25,40.5,1.5,-1,-1,-1"
-    assert [line.split(",")[0] for line in lines] == ["1", "1", "3"]
-
-
 def test_coco_is_a_data_set(tmp_path):
     write_tracks(RESULTS, tmp_path / "t.json", shape=(720, 1280, 3))
     data = json.loads((tmp_path / "t.json").read_text())

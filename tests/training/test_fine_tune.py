@@ -12,13 +12,7 @@ from vehicle_detection.errors import InvalidInputError, ModelFileError  # noqa: 
 from vehicle_detection.evaluation import LabelledFrames  # noqa: E402
 from vehicle_detection.network import load_network  # noqa: E402
 from vehicle_detection.tables import TrackTable  # noqa: E402
-from vehicle_detection.training import (  # noqa: E402
-    FrameDataset,
-    detect_logits,
-    fine_tune,
-    fine_tune_network,
-    fingerprint,
-)
+from vehicle_detection.training import FrameDataset, detect_logits, fine_tune, fine_tune_network, fingerprint  # noqa: E402
 from vehicle_detection.training.fine_tune import hold_out  # noqa: E402
 
 SOURCES = [FrameDataset("road", (drawn(range(5)),)), FrameDataset("coast", (drawn(range(5, 8), "coast"),))]

@@ -4,13 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vehicle_detection import DatasetError, InvalidInputError
-from vehicle_detection.training import (
-    RowStore,
-    make_table,
-    pareto_front,
-    read_results,
-    write_results,
-)
+from vehicle_detection.training import RowStore, make_table, pareto_front, read_results, write_results
 from vehicle_detection.training.tuning import COLUMNS
 
 

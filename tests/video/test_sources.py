@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from moviepy.config import FFMPEG_BINARY
 
-from tests.helpers import ROOT, StubDetector, answer, serve, start_interruptible
+from tests.helpers import StubDetector, answer, serve, start_interruptible
 from tests.video.clips import (
     beeps,
     damage_sizes,
@@ -236,18 +236,6 @@ def test_the_rate_of_images_is_told_if_it_is_assumed(tmp_path, caplog):
         assert ("no frame rate: 25 is assumed" in caplog.text) == warned
     with pytest.raises(InvalidInputError, match="stream must be omitted for images"):
         open_source(tmp_path, stream=1)
-
-
-def test_the_rate_of_a_pipe_is_assumed_with_a_warning(tmp_path):
-    path = write_clip(tmp_path / "raw.mjpeg", gray_frames(12), fps=12, options=RAW[0][1])
-    code = (
-        "from vehicle_detection.video import open_source;"
-        "print(*(f'{time:.2f}' for _, time, _ in open_source('-')))"
-    )
-    with path.open("rb") as file:
-        done = subprocess.run([sys.executable, "-c", code], stdin=file, capture_output=True, text=True)
-    assert [float(time) for time in done.stdout.split()] == pytest.approx(np.arange(12) / 25)
-    assert "no frame rate: 25 is assumed" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -633,12 +621,6 @@ def test_hidden_folders_are_left_out(tmp_path):
         assert [path.name for path in source.files] == ["0.png", "1.png"]
     with open_source(f"FILE://{tmp_path}") as source:
         assert len(source.files) == 2
-
-
-@pytest.mark.parametrize(("fps", "rate"), [(np.float32(10), 10), (0.0004, 0.0004), (0.5, 0.5)])
-def test_frame_rates_of_images(fps, rate):
-    with open_source(f"{ROOT}/test_images/*.jpg", fps=fps) as source:
-        assert float(source.info.fps) == pytest.approx(rate)
 
 
 def test_times_may_be_numbers_of_numpy(tmp_path):

@@ -95,7 +95,7 @@ def test_any_frame_of_any_container_can_be_the_first_one(tmp_path, suffix, fps):
     path = write_clip(
         tmp_path / f"clip.{suffix}", gray_frames(24), fps=fps, options=("-g", 16, "-c:v", *codec)
     )
-    for first in range(1, 20, 3):
+    for first in range(1, 20, 6):
         assert numbers_from(path, first, fps=fps) == [first]
 
 
@@ -113,7 +113,7 @@ def test_any_frame_of_any_container_can_be_the_first_one(tmp_path, suffix, fps):
 def test_any_frame_of_streams_without_exact_key_frames_can_be_the_first_one(tmp_path, options):
     name, *options = options
     path = write_clip(tmp_path / name, gray_frames(24), options=options)
-    for first in range(1, 20, 2):
+    for first in range(1, 20, 3):
         assert numbers_from(path, first) == [first]
 
 
