@@ -120,6 +120,7 @@ class _State:
         self.step, self.training = 0, training
         self.average = copy.deepcopy(network).eval()
         self.network = network.to(memory_format=torch.channels_last).train()
+        self.models = nn.ModuleDict({"network": self.network, "average": self.average})
         if training.frozen_statistics:
             for module in network.modules():
                 if isinstance(module, nn.BatchNorm2d):
@@ -153,8 +154,7 @@ class _State:
         """Write the state as a safetensors file."""
         from safetensors.torch import save
 
-        tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
-        tensors |= {f"average.{name}": value for name, value in self.average.state_dict().items()}
+        tensors = self.models.state_dict()
         for number, values in self.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{number}.{name}": value for name, value in values.items()}
         plain = {name: value.contiguous() for name, value in tensors.items()}
@@ -178,9 +178,7 @@ class _State:
                 f"checkpoint {path} is of an interrupted training with other frames or options; repeat "
                 "those, or remove it to start again"
             )
-        for prefix, module in ("network.", self.network), ("average.", self.average):
-            of_module = [name for name in tensors if name.startswith(prefix)]
-            module.load_state_dict({name.removeprefix(prefix): tensors[name] for name in of_module})
+        self.models.load_state_dict({name: tensors[name] for name in self.models.state_dict()})
         parameters = [each for group in self.optimizer.param_groups for each in group["params"]]
         state: dict[int, dict[str, Tensor]] = {}
         for name, value in tensors.items():
