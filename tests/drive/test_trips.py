@@ -260,9 +260,24 @@ def card(tmp_path_factory):
 def test_the_segments_of_a_pattern_become_one_video_and_several_trips_are_listed(card):
     with open_trip(str(card / "*F.mp4")) as source:
         assert [index for index, _, _ in source] == list(range(16))
-    message = r"2 trips \(front, 2 files from 20260131_081500_F.mp4; rear,"
+    message = r"2 trips \(front, 2 files from 20260131_081500_F.mp4; rear,.*, such as with '.*/\*F.mp4', or"
     with pytest.raises(InvalidInputError, match=message):
         open_trip(card)
+
+
+@pytest.mark.parametrize(
+    ("times", "selected"),
+    [
+        (("081500", "081501", "082000"), r"20260131_08150\*.mp4"),
+        (("081500", "081501", "081509"), "081500_F.mp4"),
+    ],
+)
+def test_the_pattern_for_the_first_of_several_trips_selects_no_others(card, tmp_path, times, selected):
+    clip = next(card.iterdir()).read_bytes()
+    for time in times:
+        (tmp_path / f"20260131_{time}_F.mp4").write_bytes(clip)
+    with pytest.raises(InvalidInputError, match=rf"such as with '\S*{selected}', or process all"):
+        open_trip(tmp_path)
 
 
 def test_the_clock_of_the_camera_runs_on_while_it_pauses(card, tmp_path):

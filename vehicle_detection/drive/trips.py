@@ -9,6 +9,8 @@ modification time of a numbered file is its end, unless the file was copied with
 from __future__ import annotations
 
 import contextlib
+import fnmatch
+import glob
 import itertools
 import logging
 import os
@@ -196,16 +198,30 @@ def open_trip(source: Source, **options: Any) -> FrameSource:
         trips = find_trips(files)
         if len(trips) > 1:
             listed = "; ".join(f"{trip} from {Path(trip.files[0]).name}{_gap(trip)}" for trip in trips[:4])
-            example = files[0].parent / f"*{Path(trips[0].files[0]).name[-5:]}"
             raise InvalidInputError(
                 f"source {source} holds {len(trips)} trips ({listed}{', ...' if len(trips) > 4 else ''}); "
-                f"select one with a pattern such as '{example}', or process all with vehicle-detection batch"
+                f"select one, such as with '{_pattern_of(trips[0], files)}', or process all with "
+                "vehicle-detection batch"
             )
         source = trips[0].files
     opened = open_source(source, **options)
     if isinstance(source, (list, tuple)) and len(opened.files) > 1 and is_video_file(opened.files[0]):
         _mark_gaps(opened)
     return opened
+
+
+def _pattern_of(trip: Trip, files: Sequence[Path]) -> str:
+    """Return a pattern that selects the files of a trip and no others, or else the first one of them."""
+    first, names = Path(trip.files[0]), [Path(file).name for file in trip.files]
+    if len(names) == 1:
+        return str(first)
+    columns = itertools.takewhile(lambda letters: len({*letters}) == 1, zip(*names))
+    begin = "".join(letters[0] for letters in columns)
+    for name in (f"*{glob.escape(first.name[-5:])}", f"{glob.escape(begin)}*{first.suffix}"):
+        pattern = os.path.join(glob.escape(str(first.parent)), name)
+        if [file for file in files if fnmatch.fnmatch(str(file), pattern)] == list(trip.files):
+            return pattern
+    return str(first)
 
 
 def _mark_gaps(source: FrameSource) -> None:
