@@ -339,10 +339,8 @@ class BodyPainter:
             self.names |= {"nose": nose, "low": min(max(low, dims.belt), dims.height - 0.5)}
             self.names |= {"high": 2.4 if dims.is_box else dims.height - 0.1}
             self.names |= {"outer": float(self.body.half_width(nose - 0.02)) * 0.97}
-            self.names |= {
-                "grille": nose - 0.06 - look.grille_height / 2,
-                "grille_height": look.grille_height,
-            }
+            grille = nose - 0.06 - look.grille_height / 2
+            self.names |= {"grille": grille, "grille_height": look.grille_height}
             part, plate = "front", dims.clearance + 0.27
         elif dims.is_box:
             part, plate = "box rear", 0.8
@@ -380,12 +378,10 @@ class BodyPainter:
     def paint_flank(self) -> None:
         """Paint a flank: outline, windows with pillars, wheels in their arches, doors, sill."""
         canvas, dims, body = self.canvas, self.dims, self.body
-        ends = [
-            profile_at(end, np.linspace(dims.clearance, dims.height, 50)) for end in (body.end, body.far_end)
-        ]
         y = np.linspace(dims.clearance, dims.height, 50)
-        outline = np.append(ends[0] - 0.06, dims.length - ends[1][::-1])
-        canvas.make_opaque(canvas.polygon(np.column_stack([outline, np.append(y, y[::-1])])))
+        near, far = profile_at(body.end, y) - 0.06, dims.length - profile_at(body.far_end, y)
+        outline = np.column_stack([np.append(near, far[::-1]), np.append(y, y[::-1])])
+        canvas.make_opaque(canvas.polygon(outline))
         (first, last), y = dims.windows, np.array([dims.belt + 0.02, dims.height - 0.09])
         cargo = 0.0, dims.length - 1.7
         if body.view == "front":
