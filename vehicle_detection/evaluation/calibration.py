@@ -51,18 +51,15 @@ def calibrate_scores(
     # The solver needs values of usual size; it does not converge for scores far from 0.
     center, scale = float(values.mean()), float(values.std()) or 1.0
     values = (values - center) / scale
+    samples, classes, regression = values, truth, LogisticRegression(C=1e6, tol=1e-8)
     if prior:
         # Each sample is split between both classes.
         negatives, positives = np.bincount(truth, weights=sample_weight)
         target = np.where(truth == 1, (positives + 1) / (positives + 2), 1 / (negatives + 2))
         samples, classes = np.tile(values, 2), np.repeat([1, 0], len(values))
+        sample_weight = np.concatenate([target, 1 - target]) * np.tile(sample_weight, 2)
         regression = LogisticRegression(C=np.inf, tol=1e-8, max_iter=1000)
-        split = np.concatenate([target, 1 - target]) * np.tile(sample_weight, 2)
-        regression.fit(samples[:, None], classes, sample_weight=split)
-    else:
-        regression = LogisticRegression(C=1e6, tol=1e-8).fit(
-            values[:, None], truth, sample_weight=sample_weight
-        )
+    regression.fit(samples[:, None], classes, sample_weight=sample_weight)
     slope = -float(regression.coef_[0, 0]) / scale
     return Platt(slope, -float(regression.intercept_[0]) - slope * center)
 

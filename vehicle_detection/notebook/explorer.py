@@ -52,6 +52,7 @@ METHODS: tuple[Method, ...] = get_args(Method)
 # What an image shows: the boxes alone, or also the positive windows or their heat map.
 VIEWS: tuple[View, ...] = get_args(View)
 
+_PATHS = str, os.PathLike
 _ALL_SCORES = -1e6
 _CACHED_SEARCHES, _CACHED_FRAMES = 64, 8
 _BOX_COLOR, _HORIZON_COLOR = TRACK_COLORS[1], (255, 255, 255)
@@ -402,11 +403,7 @@ def _name_frames(frames: object) -> dict[str, Any]:
     if isinstance(frames, FrameSet):
         frames = {name: frames.folder / name for name in frames.names}
     elif isinstance(frames, (list, tuple)):
-        are_paths = [isinstance(frame, (str, os.PathLike)) for frame in frames]
-        paths = [
-            str(frame) if is_path else f"frame {n}"
-            for n, (frame, is_path) in enumerate(zip(frames, are_paths))
-        ]
+        paths = [str(each) if isinstance(each, _PATHS) else f"frame {n}" for n, each in enumerate(frames)]
         names = [Path(path).name for path in paths]
         # Two files of the same name are named by their paths.
         frames = dict(zip(names if len(set(names)) == len(names) else paths, frames))
@@ -414,6 +411,6 @@ def _name_frames(frames: object) -> dict[str, Any]:
         expected = "be a list of images or paths, or a mapping from names to them, with at least one image"
         raise invalid("frames", expected, frames, "wrap a single one in a list")
     for name, frame in frames.items():
-        if not isinstance(frame, (str, os.PathLike)):
+        if not isinstance(frame, _PATHS):
             check.image(frame, f"frames[{str(name)!r}]")
     return {str(name): frame for name, frame in frames.items()}
