@@ -47,7 +47,7 @@ def bucket(monkeypatch, tmp_path):
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(SITE)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"), prepend=os.pathsep)
-    monkeypatch.setattr("vehicle_detection.video.remote._RETRY_DELAYS", (0, 0))
+    monkeypatch.setattr("vehicle_detection.video.files._RETRY_DELAYS", (0, 0))
     folder = tmp_path / "bucket"
     (folder / "cam").mkdir(parents=True)
     monkeypatch.setenv(FOLDER, str(folder))

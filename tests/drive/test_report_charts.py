@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from tests.drive.test_history import PRESENCE, table_of
 from vehicle_detection.drive.motion import track_histories
-from vehicle_detection.drive.report_charts import TimeAxis, assign_rows, format_time
+from vehicle_detection.drive.report import TimeAxis, assign_rows, format_time
 
 
 @given(st.integers(1, 2_000_000), st.sampled_from([5.0, 25.0, 29.97, 60.0]))

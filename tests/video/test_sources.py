@@ -29,6 +29,7 @@ from tests.video.clips import (
 from vehicle_detection import InvalidInputError, TransientVideoError, VideoError, write_image
 from vehicle_detection._common import web
 from vehicle_detection.video import ffmpeg as ffmpeg_module
+from vehicle_detection.video import files as files_module
 from vehicle_detection.video import (
     live,
     open_source,
@@ -36,7 +37,6 @@ from vehicle_detection.video import (
     process_video,
     read_frames,
     reading,
-    remote,
 )
 
 
@@ -340,7 +340,7 @@ def test_a_file_on_other_storage_is_copied(clip, tmp_path, monkeypatch):
 def test_without_fsspec(monkeypatch):
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(InvalidInputError, match="needs fsspec; pip install fsspec,"):
-        remote.open_filesystem("s3://bucket/x.mp4")
+        files_module.open_filesystem("s3://bucket/x.mp4")
 
 
 # --- standard input and pipes ---
@@ -482,12 +482,12 @@ def test_a_server_that_sends_too_little_fails_at_a_deadline(folder, tmp_path, mo
             request.wfile.write(data[place : place + 1])
             time.sleep(0.2)
 
-    monkeypatch.setattr(remote, "_RETRY_DELAYS", (0,))
+    monkeypatch.setattr(files_module, "_RETRY_DELAYS", (0,))
     for module in (ffmpeg_module, reading, web):
         monkeypatch.setattr(module, "NETWORK_DEADLINE", 1.0)
     with serve(handle) as address:
         with pytest.raises(TransientVideoError, match=r"slow.mp4 cannot be copied \(only"):
-            remote.download(f"{address}/slow.mp4", tmp_path)
+            files_module.download(f"{address}/slow.mp4", tmp_path)
         whole[0] = 100
         with pytest.raises(TransientVideoError, match="sends too little data for a frame"):
             open_source(f"{address}/slow.mp4")
@@ -608,7 +608,7 @@ def test_an_unexpected_error_of_a_live_stream_reaches_its_reader(tmp_path, monke
     ],
 )
 def test_names_of_local_copies(url, name):
-    assert remote.file_name(url) == name
+    assert files_module.file_name(url) == name
 
 
 def test_hidden_folders_are_left_out(tmp_path):

@@ -20,7 +20,7 @@ from vehicle_detection import (
 )
 from vehicle_detection._common import web
 from vehicle_detection.video import ffmpeg as ffmpeg_module
-from vehicle_detection.video import remote
+from vehicle_detection.video import files as files_module
 
 DASH = """<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011" type="static"
     mediaPresentationDuration="PT1S"><Period><AdaptationSet mimeType="video/mp4"><Representation id="1"
@@ -105,11 +105,11 @@ def test_copies_of_redirected_files(data, tmp_path):
         server(refer("redirect", lambda: f"{other}/a.ts", data)) as (address, _),
     ):
         with pytest.raises(InvalidInputError, match="private address"):
-            remote.download(f"{address}/first.m3u8", tmp_path)
+            files_module.download(f"{address}/first.m3u8", tmp_path)
         with pytest.raises(InvalidInputError, match="private address"):
             read_image(f"{address}/first.m3u8")
         assert not asked
-        assert remote.download(f"{address}/a.ts", tmp_path).read_bytes() == data
+        assert files_module.download(f"{address}/a.ts", tmp_path).read_bytes() == data
 
 
 @pytest.mark.parametrize(
@@ -147,13 +147,13 @@ def test_headers_that_drip_end_at_a_deadline(tmp_path, monkeypatch):
 
     for module in (web, ffmpeg_module):
         monkeypatch.setattr(module, "NETWORK_DEADLINE", 1.0)
-    monkeypatch.setattr(remote, "_RETRY_DELAYS", ())
+    monkeypatch.setattr(files_module, "_RETRY_DELAYS", ())
     monkeypatch.setattr(http.server.BaseHTTPRequestHandler, "send_header", send_slowly)
     headers = {f"X-{n}": n for n in range(100)}
     with server(lambda _: (200, headers, b"")) as (address, _):
         begun = time.monotonic()
         with pytest.raises(TransientVideoError):
-            remote.download(f"{address}/a.mp4", tmp_path)
+            files_module.download(f"{address}/a.mp4", tmp_path)
         with pytest.raises(VideoError):
             open_source(f"{address}/a.mp4", reconnect=False)
         assert time.monotonic() - begun < 15

@@ -22,7 +22,7 @@ from vehicle_detection import (
     process_video,
     read_frames,
 )
-from vehicle_detection.video import Encoding, VideoReport, encoding, engine
+from vehicle_detection.video import Encoding, VideoReport, engine, writing
 
 
 def test_a_complete_video_keeps_frames_rate_and_sound(clip, tmp_path):
@@ -199,9 +199,9 @@ def test_the_quality_is_chosen(clip, tmp_path):
     assert sizes[0] > sizes[1] > sizes[2]
 
 
-@pytest.mark.parametrize("name", encoding.ENCODERS)
+@pytest.mark.parametrize("name", writing.ENCODERS)
 def test_x264_replaces_an_encoder_that_does_not_work(clip, tmp_path, caplog, monkeypatch, name):
-    monkeypatch.setattr(encoding, "_failure", lambda encoder: f"no {encoder}")
+    monkeypatch.setattr(writing, "_encoder_failure", lambda encoder: f"no {encoder}")
     assert process_video(clip, tmp_path / "out.mp4", StubDetector(), encoding=Encoding(encoder=name)).frames
     assert "libx264" in Encoding(encoder=name).options("null")
     replaced = name not in ("auto", "x264")
@@ -209,7 +209,7 @@ def test_x264_replaces_an_encoder_that_does_not_work(clip, tmp_path, caplog, mon
 
 
 def test_the_first_encoder_that_works_is_chosen(monkeypatch):
-    monkeypatch.setattr(encoding, "_failure", lambda encoder: "" if encoder == "vaapi" else "missing")
+    monkeypatch.setattr(writing, "_encoder_failure", lambda encoder: "" if encoder == "vaapi" else "missing")
     options = " ".join(Encoding(encoder="auto", crf=30).options("null"))
     assert "-vf null,format=nv12,hwupload -c:v h264_vaapi -qp 30" in options
     assert "nvenc" in Encoding(encoder="auto")._options("nvenc", "null")[3]

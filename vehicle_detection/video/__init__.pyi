@@ -1,14 +1,12 @@
 from .clips import annotate_clip
-from .encoding import PRESETS, Encoding
 from .engine import TrackRun, VideoDetector, VideoReport, track
-from .files import is_video_file, list_files, walk_files
+from .files import download, is_video_file, list_files, open_filesystem, walk_files, with_retries
 from .horizon import estimate_video_horizon
 from .opening import Source, borrow_source, open_source, probe_video, read_frames
 from .probe import VideoInfo
-from .remote import download, open_filesystem, with_retries
 from .sources import FrameSource
 from .viewer import Viewer, open_viewer
-from .writing import check_video_target, cut_video, process_video, write_video
+from .writing import PRESETS, Encoding, check_video_target, cut_video, process_video, write_video
 
 __all__ = [
     "PRESETS",

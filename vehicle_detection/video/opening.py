@@ -22,11 +22,10 @@ from vehicle_detection.video.ffmpeg import (
     restrict_input,
     source_name,
 )
-from vehicle_detection.video.files import IMAGE_SUFFIXES, check_file, is_video_file, list_files
+from vehicle_detection.video.files import IMAGE_SUFFIXES, check_file, download, is_video_file, list_files
 from vehicle_detection.video.live import LiveStream
 from vehicle_detection.video.probe import VideoInfo, probe
 from vehicle_detection.video.reading import FrameReader, check_span, frame_range
-from vehicle_detection.video.remote import download
 from vehicle_detection.video.sources import (
     NO_RATE,
     FrameSource,

@@ -1,9 +1,14 @@
-"""`write_video`, which draws and encodes the results of `track`, and `process_video`, which is both."""
+"""`write_video`, which draws and encodes the results of `track`, and `process_video`, which is both.
+
+ffmpeg encodes H.264 by x264 or by a graphics processor; x264 replaces an encoder that fails.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
+import logging
 import os
 import shutil
 import signal
@@ -13,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Protocol, TypedDict, Unpack
+from typing import Any, Literal, Protocol, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +30,12 @@ from vehicle_detection._common import (
     check,
     check_suffix,
     describe,
+    fields,
     invalid,
     temporary_folder,
 )
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.tracking import FrameResult
-from vehicle_detection.video.encoding import Encoding
 from vehicle_detection.video.engine import TrackRun, VideoDetector, VideoReport, track
 from vehicle_detection.video.ffmpeg import Process, exit_reason, run_ffmpeg
 from vehicle_detection.video.opening import Source, borrow_source
@@ -41,6 +46,8 @@ from vehicle_detection.video.sources import FrameSource
 from vehicle_detection.video.viewer import open_viewer
 from vehicle_detection.video.yuv import planes_from_rgb
 
+_LOGGER = logging.getLogger(__name__)
+
 CONTAINERS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
 """ffmpeg's name of the container for each suffix that can be written."""
 
@@ -49,6 +56,78 @@ _COPIED_AUDIO = {"mp4": {"aac", "mp3"}, "mov": {"aac", "mp3"}}
 _COPIED_AUDIO["matroska"] = {*_COPIED_AUDIO["mp4"], "ac3", "eac3", "flac", "opus", "vorbis"}
 # Fills and cuts the sound where its times and its samples differ by more than 20 ms.
 _SYNCHRONIZED = "aresample=async=1:min_hard_comp=0.02"
+
+
+PRESETS = (
+    "ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow", "placebo",
+)  # fmt: skip
+"""Presets of x264, from the fastest to the one with the smallest files."""
+
+ENCODERS = ("x264", "auto", "nvenc", "vaapi", "videotoolbox")
+"""Encoders: on the processor; the first one that works; NVIDIA; Intel and AMD on Linux; macOS."""
+
+_USUAL_CRF = 23  # of x264
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Encoding(fields.Checked):
+    """How a video is encoded as H.264.
+
+    Attributes
+    ----------
+    preset
+        Speed of x264, from ``"ultrafast"`` (large files) to ``"placebo"`` (small ones); `PRESETS`.
+    crf
+        Quality, from 0 (best) to 51; 6 more give about half the size. None: the encoder's usual one, 23 of
+        x264. The numbers of other encoders are similar, not equal.
+    encoder
+        ``"x264"``; ``"nvenc"``, ``"vaapi"`` or ``"videotoolbox"`` for graphics processors, which are faster
+        with larger files; ``"auto"`` for one of these that works. x264 replaces one that does not work.
+
+    >>> Encoding(preset="fast", crf=20).encoder
+    'x264'
+    """
+
+    preset: str = fields.choice("veryfast", PRESETS)
+    crf: int | None = fields.integer(None, low=0, high=51)
+    encoder: Literal["x264", "auto", "nvenc", "vaapi", "videotoolbox"] = fields.choice("x264", ENCODERS)
+
+    def options(self, filters: str) -> list[str]:
+        """Return the options of ffmpeg that filter and encode frames, with an encoder that works."""
+        wanted = self.encoder
+        tried = ENCODERS[2:] if wanted == "auto" else (wanted,)
+        failures = {name: _encoder_failure(name) for name in tried if name != "x264"}
+        works = next((name for name in tried if not failures.get(name)), "x264")
+        if works != wanted:
+            reason = failures.get(wanted, "")
+            _LOGGER.log(
+                logging.WARNING if reason else logging.INFO,
+                "encoding with %s%s",
+                works,
+                f", because {wanted} does not work here ({reason})" if reason else "",
+            )
+        return self._options(works, filters)
+
+    def _options(self, encoder: str, filters: str) -> list[str]:
+        quality = _USUAL_CRF if self.crf is None else self.crf
+        if encoder == "nvenc":
+            return ["-vf", filters, "-c:v", "h264_nvenc", "-rc", "vbr", "-cq", str(quality), "-b:v", "0"]
+        if encoder == "vaapi":
+            upload = ["-vaapi_device", "/dev/dri/renderD128", "-vf", f"{filters},format=nv12,hwupload"]
+            return [*upload, "-c:v", "h264_vaapi", "-qp", str(quality)]
+        if encoder == "videotoolbox":  # its quality is 1 to 100, the best
+            return ["-vf", filters, "-c:v", "h264_videotoolbox", "-q:v", str(max(1, 100 - 2 * quality))]
+        crf = [] if self.crf is None else ["-crf", str(self.crf)]
+        return ["-vf", filters, "-c:v", "libx264", "-preset", self.preset, *crf]
+
+
+@functools.cache
+def _encoder_failure(encoder: str) -> str:
+    """Why a few frames cannot be encoded; empty if they can."""
+    frames = ("-f", "lavfi", "-i", "color=size=320x256:rate=25:duration=0.2")
+    options = Encoding()._options(encoder, "null")
+    code, log = run_ffmpeg(Path(encoder), (*frames, *options, "-f", "null", "-"), level="error")
+    return exit_reason(code, log) if code else ""
 
 
 class FrameWriter(Closing):
