@@ -116,13 +116,10 @@ def test_a_camera_file_holds_the_camera(tmp_path):
     assert half.shape == (360, 640)
     write_camera(camera, tmp_path / "half.json", (360, 640))
     assert read_camera(tmp_path / "half.json").for_shape(SHAPE) == camera
-
-
-def test_numbers_of_numpy_become_floats(tmp_path):
     camera = Camera(focal_px=np.float32(900), horizon_px=np.int64(360), fisheye=np.bool_(True))
-    write_camera(camera, tmp_path / "camera.json")
-    assert read_camera(tmp_path / "camera.json") == camera.for_shape(SHAPE)
     assert type(camera.focal_px) is float
+    write_camera(camera, tmp_path / "numpy.json")
+    assert read_camera(tmp_path / "numpy.json") == camera.for_shape(SHAPE)
 
 
 def test_a_camera_is_scaled_to_frames_of_the_same_aspect_ratio():
@@ -288,11 +285,9 @@ def test_calibrations_of_opencv_and_ros(distortion, fisheye, suffix, ros, tmp_pa
     # A point is where OpenCV projects it, and comes back as that of a pinhole.
     rays = np.array([[x, y, 1.0] for x in (-0.5, 0.2, 0.45) for y in (-0.2, 0.01, 0.3)])
     project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
-    matrix = np.array([[1002.0, 0, 640], [0, 1002, 360], [0, 0, 1]])
-    zero = np.zeros(3)
+    matrix, zero = np.array([[1002.0, 0, 640], [0, 1002, 360], [0, 0, 1]]), np.zeros(3)
     points = project(rays[:, None], zero, zero, matrix, np.array(distortion))[0][:, 0]
-    boxes = np.concatenate([points - 2, points + 2], axis=1)
-    boxes = camera.rectify_boxes(boxes, SHAPE)
+    boxes = camera.rectify_boxes(np.concatenate([points - 2, points + 2], axis=1), SHAPE)
     expected = 1002 * rays[:, :2] + [640, 360]
     assert (boxes[:, :2] + boxes[:, 2:]) / 2 == pytest.approx(expected, abs=6)
     assert open_camera(path, height_m=1.5, horizon=0.5).height_m == 1.5
@@ -311,11 +306,7 @@ def ros(matrix, distortion=""):
         ("a.yaml", ros("900,0,640,0,900,360,0,0,1", "-9,50"), "fits"),
         ("a.yaml", ros("900,0,640,0,.nan,360,0,0,1"), "finite"),
         ("a.yaml", ros("900,0,640,0,0,360,0,0,1", "1e308,1e308,0,0,0,9"), "finite"),
-        (
-            "a.json",
-            '{"image_width": Infinity, "image_height": 720, "camera_matrix": {}}',
-            "must hold image_w",
-        ),
+        ("a.json", '{"image_width": Infinity, "image_height": 9, "camera_matrix": {}}', "must hold image_w"),
         ("a.yaml", "a: [", "is not YAML"),
         ("a.yaml", "a: !!bool of", "is not YAML"),
         ("a.yaml", "a: !!int ''", "is not YAML"),

@@ -13,18 +13,9 @@ CAMERA = Camera.for_frame(SHAPE)
 DEFAULT = RegionParams()
 # Fixed parameters for tests of behavior, because the defaults may be tuned.
 PLAIN = RegionParams(
-    min_peak=0.5,
-    min_evidence=0.5,
-    min_iou=0.4,
-    suppression_radius=0.6,
-    face_width=0.8,
-    face_height=0.75,
-    face_offset_y=0.05,
-    flank_length_m=4.0,
-    flank_shift=0.25,
-    max_coverage=0.5,
-    flank_peak_ratio=0.5,
-)
+    min_peak=0.5, min_evidence=0.5, min_iou=0.4, suppression_radius=0.6, face_width=0.8, face_height=0.75,
+    face_offset_y=0.05, flank_length_m=4.0, flank_shift=0.25, max_coverage=0.5, flank_peak_ratio=0.5,
+)  # fmt: skip
 
 
 def around(center, side, *, step=8, spread=2, peak=2.0):

@@ -11,20 +11,10 @@ def blank(height=720, width=1280, value=90):
 
 def track(box=(600, 400, 700, 490), **changes):
     attributes = {
-        "id": 1,
-        "box": np.array(box, float),
-        "score": 1.25,
-        "state": "confirmed",
-        "shown": True,
-        "age": 2.0,
-        "misses": 0,
-        "time_since_update": 0.0,
-        "velocity": (3.0, 0.0),
-        "distance_m": 23.6,
-        "distance_std_m": 2.2,
-        "speed_mps": -1.75,
-        "speed_std_mps": 0.5,
-    }
+        "id": 1, "box": np.array(box, float), "score": 1.25, "state": "confirmed", "shown": True, "age": 2.0,
+        "misses": 0, "time_since_update": 0.0, "velocity": (3.0, 0.0), "distance_m": 23.6,
+        "distance_std_m": 2.2, "speed_mps": -1.75, "speed_std_mps": 0.5,
+    }  # fmt: skip
     return Track(**(attributes | changes))
 
 

@@ -136,20 +136,19 @@ def track_text(*arguments, **options):
     return "  ".join(track_fields(*arguments, **options))
 
 
-class TestText:
-    def test_shows_the_requested_and_known_fields(self):
-        assert track_text(track(), ("id", "distance", "speed")) == "#1  24 m  -6 km/h"
-        assert track_text(track(), ("distance", "std")) == "24 ± 2 m"
-        assert track_text(track(), LABEL_FIELDS) == "#1  1.2  24 ± 2 m  -6 ± 2 km/h"
-        assert track_text(track(), ()) == ""
-        assert track_text(track(), ("distance", "speed"), "imperial") == "77 ft  -4 mph"
-        assert track_text(track(confidence=0.876), ("score",)) == "88%"
-        assert track_text(track(distance_std_m=6.0), ("distance",)) == "~24 m"
-        unknown = track(distance_m=None, distance_std_m=None, speed_mps=None, speed_std_mps=None)
-        assert track_text(unknown, LABEL_FIELDS) == "#1  1.2"
-        # The own speed gives speeds over ground.
-        assert track_text(track(), ("speed",), own_mps=25.0) == "84 km/h"
-        assert track_text(track(speed_mps=-45.0), ("speed", "std"), "imperial", 25.0) == "45 ± 1 mph"
+def test_a_text_shows_the_requested_and_known_fields():
+    assert track_text(track(), ("id", "distance", "speed")) == "#1  24 m  -6 km/h"
+    assert track_text(track(), ("distance", "std")) == "24 ± 2 m"
+    assert track_text(track(), LABEL_FIELDS) == "#1  1.2  24 ± 2 m  -6 ± 2 km/h"
+    assert track_text(track(), ()) == ""
+    assert track_text(track(), ("distance", "speed"), "imperial") == "77 ft  -4 mph"
+    assert track_text(track(confidence=0.876), ("score",)) == "88%"
+    assert track_text(track(distance_std_m=6.0), ("distance",)) == "~24 m"
+    unknown = track(distance_m=None, distance_std_m=None, speed_mps=None, speed_std_mps=None)
+    assert track_text(unknown, LABEL_FIELDS) == "#1  1.2"
+    # The own speed gives speeds over ground.
+    assert track_text(track(), ("speed",), own_mps=25.0) == "84 km/h"
+    assert track_text(track(speed_mps=-45.0), ("speed", "std"), "imperial", 25.0) == "45 ± 1 mph"
 
 
 class TestDrawer:

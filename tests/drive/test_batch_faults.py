@@ -16,6 +16,7 @@ import pytest
 
 from tests.drive.batch_helpers import check_whole, counts, files, records, run, unfinished
 from tests.drive.conftest import TRIPS
+from tests.drive.test_worker_pool import kill_this_process
 from tests.helpers import ROOT, wait_until
 from tests.video.clips import child_processes
 from vehicle_detection import InvalidInputError, run_batch
@@ -145,10 +146,6 @@ def test_a_worker_that_dies_in_every_attempt_is_an_error(card, model, tmp_path, 
     assert "the worker process ended before its result, 3 times" in next(iter(report.messages.values()))
     assert batch_status(tmp_path / "out").errors == 1
     assert child_processes() == before
-
-
-def kill_this_process(task):
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_a_dask_cluster_that_loses_a_worker(many, model, tmp_path, start_batch):

@@ -330,18 +330,11 @@ def test_a_camera_of_another_size_is_scaled_or_refused():
         find_events(table, fps=FPS, shape=(500, 500), camera=large)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"own_speed_mps": -1.0}, "own_speed_mps must be a number of at least 0, or one for each frame"),
-        ({"own_speed_mps": [1.0]}, "own_speed_mps must be a number of at least 0, or one for each frame"),
-        ({"own_speed_mps": "fast"}, "own_speed_mps must be a number of at least 0"),
-    ],
-)
-def test_bad_arguments_are_refused(options, message):
+@pytest.mark.parametrize("own_speed", [-1.0, [1.0], "fast"])
+def test_an_own_speed_that_is_none_is_refused(own_speed):
     assert find_events(TrackTable(), fps=FPS, shape=SHAPE) == ()
-    with pytest.raises(InvalidInputError, match=message):
-        find_events(simulated("closing", 0)[1], **({"fps": FPS, "shape": SHAPE} | options))
+    with pytest.raises(InvalidInputError, match="own_speed_mps must be a number of at least 0, or one for"):
+        events_of("closing", 0, own_speed_mps=own_speed)
 
 
 def test_no_vehicle_is_followed_while_it_is_not_seen():

@@ -135,19 +135,13 @@ def test_a_forked_process(file, runtime):
         np.testing.assert_array_equal(SEARCH.find(IMAGE).vehicles.boxes, expected)
 
 
-SEARCH = None
-
-
 @given(st.integers(1, 400), st.integers(1, 400), st.integers(1, 10))
 def test_boxes_are_inside_the_frame(model, height, width, steps):
     image = np.random.default_rng(height).integers(0, 256, (height, width, 3), dtype=np.uint8)
-    check_inside(find(model, image, NetworkParams(input_size=32 * steps), score=-9.0), (height, width))
-
-
-def check_inside(found, shape):
+    found = find(model, image, NetworkParams(input_size=32 * steps), score=-9.0)
     for boxes in (found.windows.boxes, found.vehicles.boxes):
         assert (boxes[:, :2] >= 0).all()
-        assert (boxes[:, 2:] <= (shape[1], shape[0])).all()
+        assert (boxes[:, 2:] <= (width, height)).all()
         assert (boxes[:, 2:] > boxes[:, :2]).all()
 
 

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from vehicle_detection import TrackParams, iou_matrix
 from vehicle_detection.tracking.association import (
     center_distances,
-    covered_fractions,
     distinct_vehicles,
     hidden_edges,
     match_approaching,
@@ -36,17 +35,8 @@ def test_distances_are_in_mean_widths_and_heights():
     first, second = np.array([[0.0, 0, 40, 20]]), np.array([[30.0, 20, 50, 60], [0.0, 0, 40, 20]])
     # Centers (20, 10) and (40, 40); mean width 30, mean height 30.
     np.testing.assert_allclose(center_distances(first, second), [[math.hypot(20 / 30, 30 / 30), 0]])
-
-
-def test_distances_of_boxes_without_area_are_in_pixels():
-    empty = np.array([[5.0, 5, 5, 5]])
+    empty = np.array([[5.0, 5, 5, 5]])  # boxes without an area: in pixels
     np.testing.assert_allclose(center_distances(empty, empty + np.array([3, 4, 3, 4])), [[5]])
-
-
-def test_covered_fractions_are_of_the_first_boxes():
-    first, second = np.array([[0.0, 0, 10, 10], [5, 5, 5, 5]]), np.array([[5.0, 0, 25, 10]])
-    np.testing.assert_allclose(covered_fractions(first, second), [[0.5], [0.0]])
-    np.testing.assert_allclose(covered_fractions(second, first), [[0.25, 0.0]])
 
 
 @pytest.mark.parametrize(("shift", "pairs"), [(40.0, [(0, 0)]), (40.1, [])])
@@ -176,9 +166,8 @@ def test_a_nearer_vehicle_hides_the_edge_that_it_stands_beside():
         assert np.flatnonzero(found[0]).tolist() == expected.get(name, []), name
         assert not hidden_edges(tracked[:1], tracked, [0], np.array([True, False])).any()
     # A vehicle does not hide itself, and boxes are of the tracks in `rows`.
-    assert not hidden_edges(
-        np.array([beside["left"]]), np.array([car, beside["left"]]), [1], np.ones(2, np.bool_)
-    ).any()
+    tracked = np.array([car, beside["left"]])
+    assert not hidden_edges(tracked[1:], tracked, [1], np.ones(2, np.bool_)).any()
     assert hidden_edges(NONE, NONE, [], np.empty(0, np.bool_)).shape == (0, 4)
 
 

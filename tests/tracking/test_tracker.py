@@ -403,18 +403,13 @@ class TestOcclusion:
 
     @pytest.mark.parametrize("seed", range(4))
     def test_two_vehicles_in_one_merged_box_stay_two(self, seed):
-        def left(t):
-            return on_road(15, x=-1.2)
-
-        def right(t):
-            return on_road(16, x=1.0 - 0.2 * min(t, 3))
+        scene = {"left": lambda _: on_road(15, x=-1.2), "right": lambda t: on_road(16, x=1 - 0.2 * min(t, 3))}
 
         def region(t):
-            one, two = left(t), right(t)
+            one, two = (vehicle(t) for vehicle in scene.values())
             together = np.array([*np.minimum(one[:2], two[:2]), *np.maximum(one[2:], two[2:])])
             return [together] if 1.5 <= t < 3 else []
 
-        scene = {"left": left, "right": right}
         steps = play(scene, 5, seed=seed, undetected=lambda name, t: 1.5 <= t < 3, extra=region)
         for name in scene:
             assert len(ids(steps, name)) == 1

@@ -25,10 +25,6 @@ def planes_of(frame):
     return planes
 
 
-def frame_of(planes, encoding):
-    return rgb_from_planes(planes, encoding)
-
-
 @given(SIZES, SIZES, VALUES, VALUES, VALUES)
 def test_planes_have_the_values_of_bt601(half_height, half_width, red, green, blue):
     planes = planes_of(np.full((half_height * 2, half_width * 2, 3), (red, green, blue), np.uint8))
@@ -47,7 +43,7 @@ def test_planes_have_the_values_of_bt601(half_height, half_width, red, green, bl
 @given(VALUES, VALUES, VALUES, st.sampled_from(["unknown", "bt470bg", "bt709", "bt2020nc"]), st.booleans())
 def test_frames_follow_the_formula_of_their_encoding(luma, blue, red, space, full):
     planes = np.array([[luma] * 2] * 2 + [[blue, red]], np.uint8)
-    frame = frame_of(planes, ColorEncoding(space, full))
+    frame = rgb_from_planes(planes, ColorEncoding(space, full))
     kr, kb = {"bt709": (0.2126, 0.0722), "bt2020nc": (0.2627, 0.0593)}.get(space, (0.299, 0.114))
     if space in ("unknown", "bt470bg") and not full:
         luma = max(luma, 16)
@@ -62,7 +58,7 @@ def test_frames_follow_the_formula_of_their_encoding(luma, blue, red, space, ful
 @given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**32 - 1))
 def test_gray_is_unchanged_after_both_conversions(height, width, seed):
     gray = np.random.default_rng(seed).integers(0, 256, (height, width, 1), np.uint8).repeat(3, axis=2)
-    back = frame_of(planes_of(gray), ColorEncoding())
+    back = rgb_from_planes(planes_of(gray), ColorEncoding())
     assert np.abs(back[:height, :width].astype(int) - gray).max() <= 2
     # Odd sides are extended by their last column or row.
     assert (back[height:] == back[height - 1 : height]).all()
