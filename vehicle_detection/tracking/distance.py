@@ -43,9 +43,6 @@ _HEIGHT_STD, _HEIGHT_CHANGE = 1.0, 0.1
 # Times (s) in which the width's prior variance is added to its process noise, and over which the error of the
 # horizon (pitch and hills), and other errors that successive frames share, are correlated.
 _WIDTH_TIME, _PITCH_TIME, _SHARED_TIME = 20.0, 1.0, 2.0
-# Most frames that share the errors of a first measurement: those of `_SHARED_TIME` at 10 frames/s. With the
-# multiple of its variance that higher rates give, linearized corrections of the distance would diverge.
-_FIRST_FRAMES = 20.0
 # Error of the rate of a growth (1/s) that successive frames share.
 _GROWTH_BIAS = 0.01
 # Mean innovation of an edge (standard errors) above which a distance is uncertain, and the relative error
@@ -213,10 +210,12 @@ def _start(mean: Floats, cov: Floats, view: _View, camera: Camera) -> _View:
     by_width = view.width_scale * np.exp(mean[:, WIDTH]) / view.sides[:, 0]
     first = np.clip(np.where(is_better, by_bottom, by_width), _MIN_DISTANCE, _MAX_DISTANCE)
     mean[known, DISTANCE] = first[known]
+    # No frame before shares the errors of a first width. With a multiple of its variance, a distance would be
+    # so uncertain that linearized corrections diverge: to half of it, with small stated errors.
     return view._replace(
         sees_bottom=view.sees_bottom & (is_better | ~unknown),
         sees_height=view.sees_height & ~unknown,
-        shared_frames=np.where(known, np.minimum(view.shared_frames, _FIRST_FRAMES), view.shared_frames),
+        shared_frames=np.where(known & ~is_better, 1.0, view.shared_frames),
     )
 
 
