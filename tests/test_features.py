@@ -44,23 +44,16 @@ def test_the_presets_equal_the_reference(preset):
     [
         *({"color_space": space} for space in COLOR_SPACES),
         *({"orient": orient} for orient in (1, 2, 4, 12)),
-        {"orient": 180, "cell_per_block": 1, "hog_channel": 0},
-        {"pix_per_cell": 16},
-        {"pix_per_cell": 7, "cell_per_block": 3},
-        {"pix_per_cell": 64, "cell_per_block": 1},
+        {"orient": 180, "cell_per_block": 1, "hog_channel": 0}, {"pix_per_cell": 16},
+        {"pix_per_cell": 7, "cell_per_block": 3}, {"pix_per_cell": 64, "cell_per_block": 1},
         {"pix_per_cell": 2, "cell_per_block": 1, "hog_channel": 1},
-        *({"cell_per_block": block} for block in (1, 8)),
-        {"hog_channel": "GRAY", "color_space": "HSV"},
-        {"hog_channel": "GRAY", "transform_sqrt": True},
-        {"hog_channel": 2, "color_space": "HLS"},
+        *({"cell_per_block": block} for block in (1, 8)), {"hog_channel": "GRAY", "color_space": "HSV"},
+        {"hog_channel": "GRAY", "transform_sqrt": True}, {"hog_channel": 2, "color_space": "HLS"},
         {"transform_sqrt": True, "orient": 4},
         {"transform_sqrt": True, "orient": 180, "cell_per_block": 1, "hog_channel": 0},
-        *({"spatial_size": size} for size in (1, 64)),
-        {"spatial_size": 24, "hist_bins": 7},
-        *({"hist_bins": bins} for bins in (1, 256)),
-        {"hog_feat": False},
-        {"hog_feat": False, "spatial_feat": False},
-        {"hist_sqrt": True, "hist_bins": 256, "hog_feat": False},
+        *({"spatial_size": size} for size in (1, 64)), {"spatial_size": 24, "hist_bins": 7},
+        *({"hist_bins": bins} for bins in (1, 256)), {"hog_feat": False},
+        {"hog_feat": False, "spatial_feat": False}, {"hist_sqrt": True, "hist_bins": 256, "hog_feat": False},
         {"coarse_hog": True, "hog_channel": "GRAY", "transform_sqrt": True},
         {"coarse_hog": True, "pix_per_cell": 7, "cell_per_block": 3},
         {"coarse_hog": True, "pix_per_cell": 2, "cell_per_block": 1, "hog_channel": 1},
@@ -69,7 +62,7 @@ def test_the_presets_equal_the_reference(preset):
         {"color_space": "LUV", "hist_color_space": "HLS", "hist_sqrt": True, "hog_channel": 0},
     ],
     ids=str,
-)
+)  # fmt: skip
 def test_other_parameters_equal_the_reference(changes):
     assert_equals_the_reference(PATCHES[::2], dataclasses.replace(FeatureParams(), **changes))
 
@@ -83,20 +76,12 @@ def feature_params(draw):
         color_space=draw(st.sampled_from(COLOR_SPACES)),
         spatial_color_space=draw(st.sampled_from((None, *COLOR_SPACES))),
         hist_color_space=draw(st.sampled_from((None, *COLOR_SPACES))),
-        spatial_order=draw(st.sampled_from(SPATIAL_ORDERS)),
-        spatial_feat=parts[0],
-        hist_feat=parts[1],
-        hog_feat=True,
-        spatial_size=draw(st.integers(1, 64)),
-        hist_bins=draw(st.integers(1, 256)),
-        orient=draw(st.integers(1, 20)),
-        pix_per_cell=cell,
-        cell_per_block=block,
-        hog_channel=draw(st.sampled_from(HOG_CHANNELS)),
-        transform_sqrt=draw(st.booleans()),
-        hist_sqrt=draw(st.booleans()),
-        coarse_hog=64 // cell // 2 >= block and draw(st.booleans()),
-    )
+        spatial_order=draw(st.sampled_from(SPATIAL_ORDERS)), spatial_feat=parts[0], hist_feat=parts[1],
+        hog_feat=True, spatial_size=draw(st.integers(1, 64)), hist_bins=draw(st.integers(1, 256)),
+        orient=draw(st.integers(1, 20)), pix_per_cell=cell, cell_per_block=block,
+        hog_channel=draw(st.sampled_from(HOG_CHANNELS)), transform_sqrt=draw(st.booleans()),
+        hist_sqrt=draw(st.booleans()), coarse_hog=64 // cell // 2 >= block and draw(st.booleans()),
+    )  # fmt: skip
 
 
 @given(feature_params(), st.integers(0, len(PATCHES) - 1), st.integers(0, 2**32 - 1))

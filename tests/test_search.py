@@ -72,8 +72,7 @@ def test_presets_equal_the_reference(preset, window):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"pix_per_cell": 16},
-        {"pix_per_cell": 16, "cell_per_block": 3, "spatial_size": 8},
+        {"pix_per_cell": 16}, {"pix_per_cell": 16, "cell_per_block": 3, "spatial_size": 8},
         {"pix_per_cell": 64, "cell_per_block": 1, "spatial_size": 1},
         {"pix_per_cell": 4, "cell_per_block": 4, "orient": 4, "hog_channel": 1},
         *({"cell_per_block": block} for block in (1, 3)),
@@ -82,12 +81,9 @@ def test_presets_equal_the_reference(preset, window):
         {"hog_channel": "GRAY", "transform_sqrt": True, "color_space": "HSV"},
         *({"orient": orient} for orient in (1, 4, 12)),
         *({part: False} for part in ("spatial_feat", "hist_feat", "hog_feat")),
-        {"spatial_feat": False, "hist_feat": False},
-        {"hist_feat": False, "hog_feat": False},
-        *({"hist_bins": bins} for bins in (1, 20, 256)),
-        *({"spatial_size": size} for size in (8, 32, 64)),
-        *({"color_space": space} for space in COLOR_SPACES),
-        {"coarse_hog": True},
+        {"spatial_feat": False, "hist_feat": False}, {"hist_feat": False, "hog_feat": False},
+        *({"hist_bins": bins} for bins in (1, 20, 256)), *({"spatial_size": size} for size in (8, 32, 64)),
+        *({"color_space": space} for space in COLOR_SPACES), {"coarse_hog": True},
         {"coarse_hog": True, "hog_channel": "GRAY", "transform_sqrt": True},
         {"coarse_hog": True, "cell_per_block": 1, "orient": 8},
         {"coarse_hog": True, "pix_per_cell": 4, "cell_per_block": 3, "hog_channel": 0},
@@ -102,7 +98,7 @@ def test_presets_equal_the_reference(preset, window):
         {"hist_color_space": "LUV", "hist_sqrt": True, "hog_channel": 0},
     ],
     ids=str,
-)
+)  # fmt: skip
 def test_other_features_equal_the_reference(changes):
     classifier = random_classifier(dataclasses.replace(FeatureParams(), **changes))
     assert_equals_the_reference(IMAGE, band_of((80, 80), x=(5, 213), y=(40, 152)), classifier)

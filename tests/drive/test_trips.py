@@ -211,15 +211,10 @@ def test_the_query_of_a_url_tells_no_time():
 @pytest.mark.parametrize(
     "names",
     [
-        ("car07_{}", "car08_{}"),
-        ("ch1_{}", "ch2_{}"),
-        ("{}_ch1", "{}_ch2"),
-        ("{}_1", "{}_2"),
-        ("Front_01_{}", "Front_02_{}"),
-        ("AB123CD_{}_F", "AB456CD_{}_F"),
-        ("123AB_{}_F", "456AB_{}_F"),
+        ("car07_{}", "car08_{}"), ("ch1_{}", "ch2_{}"), ("{}_ch1", "{}_ch2"), ("{}_1", "{}_2"),
+        ("Front_01_{}", "Front_02_{}"), ("AB123CD_{}_F", "AB456CD_{}_F"), ("123AB_{}_F", "456AB_{}_F"),
     ],
-)
+)  # fmt: skip
 def test_vehicles_and_channels_are_trips_of_their_own(names):
     times = [f"20260131_0815{second:02}" for second in (0, 5, 10, 15)]
     found = summary([f"{name.format(time)}.mp4" for name in names for time in times], 5.0)

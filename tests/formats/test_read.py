@@ -186,6 +186,7 @@ def coco(**changes):
 
 
 BOX = {"image_id": 5, "category_id": 1, "bbox": [1, 2, 3, 4]}
+MIXED = [json.dumps({"frame": frame, "track": 1, "x1": 1, "y1": 1, "x2": 9, "y2": 9}) for frame in (0, "a")]
 
 
 def test_coco_file(tmp_path):
@@ -221,6 +222,8 @@ def test_coco_file(tmp_path):
         ("a.json", coco(categories=[{"id": 1, "name": "boat"}]), "no category among bus, .* found 'boat'"),
         ("a.jsonl", '{"frame": 0}\n', "lacks the columns track, x1, .*; found frame"),
         ("a.jsonl", "{", "line 1: not a JSON object"),
+        ("a.jsonl", "\n".join(MIXED), "frame must be a number in every row, or a name in every row"),
+        ("a.jsonl", "\n".join(MIXED[::-1]), "frame must be a number in every row, or a name"),
         ("a.jsonl", "\n[]", "line 2: expected a JSON object, found"),
         ("a.parquet", "frame", "is not a Parquet file"),
         ("a.txt", "Car 0 0 0 1 2 3", "lacks the columns"),

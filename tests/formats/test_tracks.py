@@ -48,21 +48,13 @@ boxes = st.tuples(number, number, st.floats(0, 1e4), st.floats(0, 1e4)).map(
 unknown, positive = st.none() | number, st.none() | st.floats(0, 1e4)
 rows = st.lists(
     st.builds(
-        lambda frame, vehicle, box, *others: (frame, vehicle, *box, *others),
-        st.integers(0, 10**6),
-        st.integers(1, 10**6),
-        boxes,
-        number,
-        unknown,
-        unknown,
-        st.none() | st.floats(0, 1),
-        positive,
-        positive,
-        st.sampled_from(["vehicle", "car", "motorcycle", "=bus"]),
+        lambda frame, vehicle, box, *others: (frame, vehicle, *box, *others), st.integers(0, 10**6),
+        st.integers(1, 10**6), boxes, number, unknown, unknown, st.none() | st.floats(0, 1), positive,
+        positive, st.sampled_from(["vehicle", "car", "motorcycle", "=bus"]),
     ),
     max_size=8,
     unique_by=lambda row: row[:2],
-).map(lambda rows: sorted(rows, key=lambda row: row[0]))
+).map(lambda rows: sorted(rows, key=lambda row: row[0]))  # fmt: skip
 
 
 def read_csv(path):

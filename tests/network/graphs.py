@@ -48,15 +48,11 @@ def own_network(seed=0, *, size=("height", "width"), weights=None, params=None, 
     ]
     header = {"format_version": version, "params": params or PARAMS, "metadata": {"frames": 12}}
     initializers = [
-        ("gray", np.float32(115)),
-        ("factor", np.float32(1 / 64)),
-        ("kernel", kernel if weights is None else np.full_like(kernel, weights)),
-        ("bias", bias),
-        ("flat", np.array([1, 5, -1])),
-        ("parts", np.array([2, 2, 1])),
-        ("spread", np.float32(60)),
+        ("gray", np.float32(115)), ("factor", np.float32(1 / 64)),
+        ("kernel", kernel if weights is None else np.full_like(kernel, weights)), ("bias", bias),
+        ("flat", np.array([1, 5, -1])), ("parts", np.array([2, 2, 1])), ("spread", np.float32(60)),
         ("middle", np.float32(160)),
-    ]
+    ]  # fmt: skip
     return serialize(
         nodes,
         [("image", "uint8", [1, *size, 3])],
@@ -86,14 +82,10 @@ def spot_network():
     ]
     initializers = [
         ("mean", np.full((1, 3, 32, 32), 0.1 / (3 * 32 * 32), np.float32)),
-        ("offset", np.array([-0.1 * 180], np.float32)),
-        ("zero", np.float32(0)),
-        ("stride", np.float32(32)),
-        ("half", np.float32(16)),
-        ("horizontal", np.array(3)),
-        ("vertical", np.array(2)),
+        ("offset", np.array([-0.1 * 180], np.float32)), ("zero", np.float32(0)), ("stride", np.float32(32)),
+        ("half", np.float32(16)), ("horizontal", np.array(3)), ("vertical", np.array(2)),
         ("flat", np.array([1, 5, -1])),
-    ]
+    ]  # fmt: skip
     params = PARAMS | {"slope": 1.0, "offset": 0.0, "threshold": 0.0}
     header = {"format_version": 1, "params": params, "metadata": {}}
     ports = [("image", "uint8", [1, "height", "width", 3])], [("boxes", "float32", [1, 5, "n"])]

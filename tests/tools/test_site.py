@@ -102,13 +102,8 @@ class TestLinks:
     @pytest.mark.parametrize(
         ("link", "broken"),
         [
-            ("b.html#place", False),
-            ("b.html", False),
-            ("https://example.org/c.html", False),
-            ("#here", False),
-            ("b.html#elsewhere", True),
-            ("c.html", True),
-            ("#elsewhere", True),
+            *((link, False) for link in ("b.html#place", "b.html", "https://example.org/c.html", "#here")),
+            *((link, True) for link in ("b.html#elsewhere", "c.html", "#elsewhere")),
         ],
     )
     def test_missing_files_and_anchors_are_found(self, tmp_path, capsys, link, broken):

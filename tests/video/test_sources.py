@@ -30,14 +30,7 @@ from vehicle_detection import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection._common import web
 from vehicle_detection.video import ffmpeg as ffmpeg_module
 from vehicle_detection.video import files as files_module
-from vehicle_detection.video import (
-    live,
-    open_source,
-    probe_video,
-    process_video,
-    read_frames,
-    reading,
-)
+from vehicle_detection.video import live, open_source, probe_video, process_video, read_frames, reading
 
 
 def numbers(source, **options):
