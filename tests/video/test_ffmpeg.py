@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -9,6 +10,7 @@ import sys
 import time
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
@@ -178,6 +180,14 @@ def test_an_interrupt_while_ffmpeg_starts_leaves_no_process(clip, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         Process(("-f", "lavfi", "-i", "testsrc", "-f", "null", "-"))
     wait_until(lambda: child_processes() == before)
+
+
+def test_a_full_folder_of_temporary_files_is_the_reason_for_an_empty_log(monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=4096))
+    assert re.fullmatch("the folder of temporary files, .* is full; free some disk space", exit_reason(1, ""))
+        "the folder of temporary files, .*, is full; free some disk space", exit_reason(1, "")
+    )
+    assert exit_reason(1, "Invalid data") == "ffmpeg reports 'Invalid data'"
 
 
 def test_reasons_of_signals():

@@ -35,6 +35,8 @@ from vehicle_detection._common import (
 from vehicle_detection.errors import TransientVideoError, VideoError
 
 _PIPE_BYTES = 1 << 18
+# Free bytes below which the folder of temporary files is full.
+_FULL = 1 << 16
 # Signals by which ffmpeg ends itself, because of the file.
 _CRASHES = {signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGILL}
 # Messages of ffmpeg about a server, a connection or an expired signature, rather than about the video.
@@ -372,6 +374,8 @@ def exit_reason(code: int, log: str) -> str:
             return "the file would exceed the limit of the system for the size of a file (ulimit -f)"
         hint = ", perhaps because memory ran out" if name == "SIGKILL" else ""
         return f"another process ended ffmpeg by the signal {name}{hint}"
+    if not log and shutil.disk_usage(folder := tempfile.gettempdir()).free < _FULL:  # where its log is
+        return f"the folder of temporary files, {folder}, is full; free some disk space"
     hint = "; free some disk space" if "No space left" in log else ""
     fault = _SYSTEM_FAULT.search(log)  # other messages may follow
     return f"ffmpeg reports {last_line(fault[0] if fault else log)!r}{hint}"
