@@ -185,8 +185,6 @@ def test_an_interrupt_while_ffmpeg_starts_leaves_no_process(clip, monkeypatch):
 def test_a_full_folder_of_temporary_files_is_the_reason_for_an_empty_log(monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=4096))
     assert re.fullmatch("the folder of temporary files, .* is full; free some disk space", exit_reason(1, ""))
-        "the folder of temporary files, .*, is full; free some disk space", exit_reason(1, "")
-    )
     assert exit_reason(1, "Invalid data") == "ffmpeg reports 'Invalid data'"
 
 
