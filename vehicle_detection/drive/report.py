@@ -519,10 +519,10 @@ class TimeAxis:
         """Position of the beginning of a frame, as a percentage of the width."""
         return frame / self.frames * 100
 
-    def ticks(self, max_ticks: int = 6) -> list[float]:
-        """Round times in seconds from 0 on, at most about `max_ticks`."""
-        hours = 3600 * math.ceil(self.seconds / 3600 / max_ticks)
-        step = next((step for step in _TICK_STEPS if self.seconds / step < max_ticks), hours)
+    def ticks(self) -> list[float]:
+        """Round times in seconds from 0 on, about six or fewer."""
+        hours = 3600 * math.ceil(self.seconds / 3600 / 6)
+        step = next((step for step in _TICK_STEPS if self.seconds / step < 6), hours)
         return [number * step for number in range(int(self.seconds / step) + 1)]
 
     def marks(self) -> list[tuple[float, str]]:
