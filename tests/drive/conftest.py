@@ -34,12 +34,22 @@ def model(tmp_path_factory):
 
 @pytest.fixture
 def private_scratch(tmp_path, monkeypatch):
-    (tmp_path / "scratch").mkdir()
+    """A folder for temporary files, in which no trip of a batch leaves any."""
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
     # `tempfile` reads the variable once.
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
-    monkeypatch.setenv("TMPDIR", str(tmp_path / "scratch"))
+    monkeypatch.setattr("tempfile.tempdir", str(scratch))
+    monkeypatch.setenv("TMPDIR", str(scratch))
     if "NUMBA_CACHE_DIR" not in os.environ:
         monkeypatch.setenv("NUMBA_CACHE_DIR", str(ROOT / ".pytest_cache" / "kernels"))
+    yield
+    assert not list(scratch.glob(".vehicle-*"))
+
+
+@pytest.fixture
+def out(tmp_path):
+    """The folder of the results of a batch."""
+    return tmp_path / "out"
 
 
 @pytest.fixture

@@ -29,8 +29,7 @@ pytestmark = pytest.mark.usefixtures("private_scratch")
 parquet = pytest.importorskip("pyarrow.parquet")
 
 
-def test_outputs_are_partitioned_and_equal_process_video(card, model, tmp_path):
-    out = tmp_path / "out"
+def test_outputs_are_partitioned_and_equal_process_video(card, model, tmp_path, out):
     seen = []
     report = run(card, out, model, on_record=seen.append)
     # Neither segment follows the other one: it is half a second long, and names hold whole seconds.
@@ -57,8 +56,7 @@ def test_outputs_are_partitioned_and_equal_process_video(card, model, tmp_path):
     assert batch_status(out).done == 3
 
 
-def test_a_second_run_does_what_is_missing_or_changed(card, model, tmp_path):
-    out = tmp_path / "out"
+def test_a_second_run_does_what_is_missing_or_changed(card, model, out):
     options = {"tracks_only": True, "group": "file"}
     assert counts(run(card, out, model, **options)) == (5, 0, 0, 0)
     before = files(out)
@@ -98,29 +96,29 @@ def test_results_may_lie_beside_the_sources(card, model, tmp_path):
         run(next(folder.glob("videos/date=*")), folder, model)
 
 
-def test_another_camera_file_changes_the_results(card, model, tmp_path):
+def test_another_camera_file_changes_the_results(card, model, tmp_path, out):
     camera, one = tmp_path / "camera.json", str(card / "*0930*")
     given = {"camera": camera, "conf": np.float32(0.5), "every": np.int64(3)}  # not JSON as they are
     options = {"tracks_only": True, "options": given}
     for angle, done in ((60, 1), (60, 0), (120, 1)):
         camera.write_text(json.dumps({"fov": angle}))
-        assert counts(run(one, tmp_path / "out", model, **options)) == (done, 0, 0, 1 - done)
-    check_whole(tmp_path / "out", done=1, failed=0)
+        assert counts(run(one, out, model, **options)) == (done, 0, 0, 1 - done)
+    check_whole(out, done=1, failed=0)
 
 
-def test_shards_are_disjoint_and_complete(card, model, tmp_path):
+def test_shards_are_disjoint_and_complete(card, model, out):
     options = {"tracks_only": True, "group": "file"}
-    reports = [run(card, tmp_path / "out", model, shard=f"{n}/3", **options) for n in (1, 2, 3)]
+    reports = [run(card, out, model, shard=f"{n}/3", **options) for n in (1, 2, 3)]
     assert sum(report.trips for report in reports) == sum(report.done for report in reports) == 5
-    check_whole(tmp_path / "out", done=5, failed=0)
+    check_whole(out, done=5, failed=0)
 
 
-def test_numbered_files_are_told_apart_by_their_times(clip, model, tmp_path):
+def test_numbered_files_are_told_apart_by_their_times(clip, model, tmp_path, out):
     for number, end in ((1, 0), (2, 0.48), (3, 0.96), (4, 7000)):  # the clip lasts 0.48 s
         copy = shutil.copy(clip, tmp_path / f"GRMN000{number}.mp4")
         os.utime(copy, (1.77e9 + end, 1.77e9 + end))
-    assert counts(run(tmp_path, tmp_path / "out", model, tracks_only=True)) == (2, 0, 0, 0)
-    assert sorted(each["frames"] for each in records(tmp_path / "out").values()) == [12, 36]
+    assert counts(run(tmp_path, out, model, tracks_only=True)) == (2, 0, 0, 0)
+    assert sorted(each["frames"] for each in records(out).values()) == [12, 36]
 
 
 def test_threads_do_not_share_a_detector(card, model, tmp_path):
@@ -136,8 +134,8 @@ def test_threads_do_not_share_a_detector(card, model, tmp_path):
     assert tables[0] == tables[1]
 
 
-def test_a_bad_file_is_recorded_once(many, model, tmp_path):
-    source, out = str(many / "drive [de].mp4"), tmp_path / "out"
+def test_a_bad_file_is_recorded_once(many, model, out):
+    source = str(many / "drive [de].mp4")
     report = run(source, out, model, tracks_only=True)
     assert counts(report) == (1, 1, 0, 0)
     ((name, message),) = report.messages.items()
@@ -150,8 +148,7 @@ def test_a_bad_file_is_recorded_once(many, model, tmp_path):
     assert "drive e.mp4 " in str(status)
 
 
-def test_the_summary_has_a_row_for_each_trip(many, card, model, tmp_path):
-    out = tmp_path / "out"
+def test_the_summary_has_a_row_for_each_trip(many, card, model, tmp_path, out):
     run([many / "drive a.mp4", many / "drive e.mp4", card], out, model, tracks_only=True)
     table = batch_summary(out)
     assert table["status"].value_counts().to_dict() == {"done": 4, "failed": 1}
@@ -166,17 +163,17 @@ def test_the_summary_has_a_row_for_each_trip(many, card, model, tmp_path):
     assert len(pandas.read_csv(tmp_path / "trips.csv")) == 5
 
 
-def test_the_record_of_a_damaged_file_says_what_is_missing(clip, model, tmp_path):
+def test_the_record_of_a_damaged_file_says_what_is_missing(clip, model, tmp_path, out):
     source = damage_sizes(clip, tmp_path / "lost.mp4", entry=3, byte=0, flip=64)
-    assert counts(run(str(source), tmp_path / "out", model, tracks_only=True)) == (1, 0, 0, 0)
-    (record,) = records(tmp_path / "out").values()
+    assert counts(run(str(source), out, model, tracks_only=True)) == (1, 0, 0, 0)
+    (record,) = records(out).values()
     assert "lost.mp4 is damaged: 9 of 12 frames cannot be decoded" in record["damage"]
-    status = batch_status(tmp_path / "out")
+    status = batch_status(out)
     assert (status.done, dict(status.messages)) == (1, {str(source): record["damage"]})
 
 
-def test_a_full_disk_is_an_error_that_the_next_run_repeats(card, model, tmp_path, monkeypatch):
-    source, out = str(card / "*0930*"), tmp_path / "out"
+def test_a_full_disk_is_an_error_that_the_next_run_repeats(card, model, tmp_path, out, monkeypatch):
+    source = str(card / "*0930*")
     with monkeypatch.context() as patch:
         patch.setattr(store.shutil, "copyfile", FULL_DISK)
         report = run(source, out, model)
@@ -185,7 +182,6 @@ def test_a_full_disk_is_an_error_that_the_next_run_repeats(card, model, tmp_path
     assert batch_status(out).errors == 1
     assert counts(run(source, out, model)) == (1, 0, 0, 0)
     check_whole(out, done=1, failed=0)
-    assert not list((tmp_path / "scratch").glob(".vehicle-*"))
 
 
 NO_MEMORY = "echo 'x: Cannot allocate memory'; echo '  handler_name : SoundHandler'; exit 244"
@@ -205,7 +201,7 @@ NO_MEMORY = "echo 'x: Cannot allocate memory'; echo '  handler_name : SoundHandl
     ],
 )  # fmt: skip
 def test_an_ffmpeg_without_resources_is_an_error_and_a_crashed_one_a_failure(
-    card, model, tmp_path, monkeypatch, end, limited, status
+    card, model, tmp_path, out, monkeypatch, end, limited, status
 ):
     """A stand-in for ffmpeg ends by a signal, or with an error about the machine or the file."""
     program = tmp_path / "ffmpeg"
@@ -213,8 +209,8 @@ def test_an_ffmpeg_without_resources_is_an_error_and_a_crashed_one_a_failure(
     program.chmod(0o755)
     monkeypatch.setattr("vehicle_detection.video.ffmpeg.ffmpeg_binary", lambda: str(program))
     monkeypatch.setattr("vehicle_detection.video.ffmpeg._is_memory_limited", lambda: limited)
-    report = run(str(card / "*0930*"), tmp_path / "out", model)
-    assert [record["status"] for record in records(tmp_path / "out").values()] == [status]
+    report = run(str(card / "*0930*"), out, model)
+    assert [record["status"] for record in records(out).values()] == [status]
     assert counts(report) == (0, status == "failed", status == "error", 0)
 
 
@@ -228,15 +224,15 @@ def test_an_ffmpeg_without_resources_is_an_error_and_a_crashed_one_a_failure(
         (MemoryError(), "error"),
     ],
 )
-def test_what_the_machine_is_to_blame_for_is_an_error(card, model, tmp_path, monkeypatch, error, status):
+def test_what_the_machine_is_to_blame_for_is_an_error(card, model, out, monkeypatch, error, status):
     monkeypatch.setattr(trip_module, "process_video", failing(error))
-    run(str(card / "*0930*"), tmp_path / "out", model)
-    assert [record["status"] for record in records(tmp_path / "out").values()] == [status]
+    run(str(card / "*0930*"), out, model)
+    assert [record["status"] for record in records(out).values()] == [status]
 
 
-def test_a_trip_that_another_run_is_working_on_is_awaited(card, model, tmp_path, monkeypatch):
+def test_a_trip_that_another_run_is_working_on_is_awaited(card, model, out, monkeypatch):
     fcntl = pytest.importorskip("fcntl")
-    source, out = str(card / "*0930*"), tmp_path / "out"
+    source = str(card / "*0930*")
     (out / "locks").mkdir(parents=True)
     identity = identity_of(source)
     with (out / "locks" / f"{identity}.lock").open("w") as file:
@@ -291,15 +287,15 @@ def test_bad_arguments(card, model, tmp_path, monkeypatch, options, message):
         batch_status("nowhere")
 
 
-def test_a_missing_pyarrow_is_reported_before_the_first_trip(card, model, tmp_path, monkeypatch):
+def test_a_missing_pyarrow_is_reported_before_the_first_trip(card, model, out, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    arguments = ["batch", str(card), "-o", str(tmp_path / "out"), "--model", str(model)]
+    arguments = ["batch", str(card), "-o", str(out), "--model", str(model)]
     planned = CliRunner().invoke(app, [*arguments, "--dry-run"])
     assert planned.exit_code == 0, planned.output
     refused = CliRunner().invoke(app, arguments)
     assert refused.exit_code == 2
     assert refused.stderr == "error: .parquet files need pyarrow; pip install pyarrow\n"
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
 
 
 def test_annotated_videos_are_no_sources(card, model, tmp_path):
@@ -328,9 +324,9 @@ def test_linked_folders_are_searched_once(card, tmp_path):
 
 
 @pytest.mark.parametrize("changed", [False, True])
-def test_a_trip_whose_first_segment_is_gone(clip, model, tmp_path, changed):
+def test_a_trip_whose_first_segment_is_gone(clip, model, tmp_path, out, changed):
     """A camera that records in a loop deletes the oldest segment."""
-    card, out = tmp_path / "card", tmp_path / "out"
+    card = tmp_path / "card"
     card.mkdir()
     for second in range(5):
         shutil.copy2(clip, card / f"20260131_08150{second}_F.mp4")
@@ -354,21 +350,21 @@ def test_a_trip_whose_first_segment_is_gone(clip, model, tmp_path, changed):
         assert {each["start"] for each in found.values()} == {"2026-01-31T08:15:00", "2026-01-31T08:15:05"}
 
 
-def test_another_model_in_the_same_file(card, tmp_path):
+def test_another_model_in_the_same_file(card, tmp_path, out):
     """Workers that live longer than a run keep their detector."""
     one, path = card / "20260131_093000_F.mp4", tmp_path / "own.onnx"
     rows = []
     with ThreadPoolExecutor(1) as executor:
         for seed in (0, 1):
             write_network(path, seed)
-            run_batch(one, tmp_path / "out", executor, model=path, tracks_only=True, progress=False)
-            rows.append(parquet.read_table(tmp_path / "out" / "tracks")["score"].to_pylist())
+            run_batch(one, out, executor, model=path, tracks_only=True, progress=False)
+            rows.append(parquet.read_table(out / "tracks")["score"].to_pylist())
     write_network(path, 1)
     run(one, tmp_path / "fresh", path, tracks_only=True)
     assert parquet.read_table(tmp_path / "fresh" / "tracks")["score"].to_pylist() == rows[1] != rows[0]
 
 
-def test_another_model_file_on_a_worker_is_an_error(card, tmp_path, monkeypatch):
+def test_another_model_file_on_a_worker_is_an_error(card, tmp_path, out, monkeypatch):
     path = tmp_path / "own.onnx"
     write_network(path)
 
@@ -377,13 +373,13 @@ def test_another_model_file_on_a_worker_is_an_error(card, tmp_path, monkeypatch)
         return trip_module.run_trip(task)
 
     monkeypatch.setattr("vehicle_detection.drive.batch.run_trip", elsewhere)
-    report = run(card / "20260131_093000_F.mp4", tmp_path / "out", path, tracks_only=True)
+    report = run(card / "20260131_093000_F.mp4", out, path, tracks_only=True)
     assert counts(report) == (0, 0, 1, 0)
     assert "is not the one with which the batch was started" in next(iter(report.messages.values()))
 
 
-def test_records_of_runs_with_other_parameters_at_the_same_time(card, model, tmp_path):
-    one, out = card / "20260131_093000_F.mp4", tmp_path / "out"
+def test_records_of_runs_with_other_parameters_at_the_same_time(card, model, out):
+    one = card / "20260131_093000_F.mp4"
     run(one, out, model, tracks_only=True)
     first = next((out / "records").iterdir()).read_text()
     (key,) = records(out)
@@ -398,7 +394,7 @@ def test_records_of_runs_with_other_parameters_at_the_same_time(card, model, tmp
     check_whole(out, done=1, failed=0)
 
 
-def test_an_error_cancels_trips_that_have_not_begun(many, model, tmp_path):
+def test_an_error_cancels_trips_that_have_not_begun(many, model, out):
     def stop(record):
         raise KeyError("stop")
 
@@ -418,15 +414,15 @@ def test_an_error_cancels_trips_that_have_not_begun(many, model, tmp_path):
 
     with Counting(1) as executor:
         with pytest.raises(KeyError, match="stop"):
-            run_batch(many, tmp_path / "out", executor, model=model, progress=False, on_record=stop)
+            run_batch(many, out, executor, model=model, progress=False, on_record=stop)
         ended.set()
     assert len(began) <= 2
     assert all(call.cancelled() for call in calls[2:])
 
 
 @pytest.mark.usefixtures("in_process")
-def test_an_unknown_lens_has_one_warning(card, model, tmp_path):
-    words = ["batch", "-o", str(tmp_path / "out"), "--tracks-only", "--model", str(model)]
+def test_an_unknown_lens_has_one_warning(card, model, out):
+    words = ["batch", "-o", str(out), "--tracks-only", "--model", str(model)]
     source = str(card / "20260131_093000_F.mp4")
     assert "distances assume a lens of 58 degrees" in CliRunner().invoke(app, [*words, source]).stderr
     known = CliRunner().invoke(app, [*words, "--fov", "90", source])
@@ -436,17 +432,16 @@ def test_an_unknown_lens_has_one_warning(card, model, tmp_path):
 
 
 @pytest.mark.usefixtures("in_process")
-def test_a_log_that_cannot_be_written_does_not_end_a_batch(card, model, tmp_path, monkeypatch):
+def test_a_log_that_cannot_be_written_does_not_end_a_batch(card, model, out, monkeypatch):
     monkeypatch.setattr("vehicle_detection.cli.batch.print_error", FULL_DISK)
-    words = ["batch", "-o", tmp_path / "out", "--tracks-only", "--model", model, "--fov", 90, card]
+    words = ["batch", "-o", out, "--tracks-only", "--model", model, "--fov", 90, card]
     CliRunner().invoke(app, [str(word) for word in words])
-    assert len(records(tmp_path / "out")) == 3
+    assert len(records(out)) == 3
 
 
-def test_a_dry_run_changes_nothing(card, model, tmp_path, monkeypatch):
+def test_a_dry_run_changes_nothing(card, model, tmp_path, out, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "None").touch()  # no camera is given, hence no file of one
-    out = tmp_path / "out"
     options = {"tracks_only": True, "dry_run": True}
     report = run(card, out, model, **options)
     assert not out.exists()

@@ -43,11 +43,8 @@ def forbidden(path):
 
 
 @pytest.mark.parametrize("fault", [away, forbidden])
-def test_a_source_without_access_is_an_error_that_the_next_run_repeats(
-    one, model, tmp_path, monkeypatch, fault
-):
+def test_a_source_without_access_is_an_error_that_the_next_run_repeats(one, model, out, monkeypatch, fault):
     """It does not change when access is given again, so a failure would be recorded forever."""
-    out = tmp_path / "out"
 
     def without_access(task):
         with fault(one):
@@ -62,8 +59,7 @@ def test_a_source_without_access_is_an_error_that_the_next_run_repeats(
     check_whole(out, done=1, failed=0)
 
 
-def test_an_error_keeps_the_results_of_earlier_runs(one, model, tmp_path, monkeypatch):
-    out = tmp_path / "out"
+def test_an_error_keeps_the_results_of_earlier_runs(one, model, out, monkeypatch):
     run(one, out, model, tracks_only=True)
     before = files(out / "tracks")
     with monkeypatch.context() as patch:
@@ -79,8 +75,8 @@ def test_an_error_keeps_the_results_of_earlier_runs(one, model, tmp_path, monkey
     check_whole(out, done=1, failed=0)
 
 
-def test_a_source_that_is_bad_now_keeps_its_results(one, model, tmp_path):
-    out, whole = tmp_path / "out", one.read_bytes()
+def test_a_source_that_is_bad_now_keeps_its_results(one, model, out):
+    whole = one.read_bytes()
     run(one, out, model)
     for size in (3000, 2000):
         one.write_bytes(whole[:size])
@@ -91,7 +87,7 @@ def test_a_source_that_is_bad_now_keeps_its_results(one, model, tmp_path):
     check_whole(out, done=1, failed=0)
 
 
-def test_videos_are_written_on_a_local_disk(one, model, tmp_path, monkeypatch):
+def test_videos_are_written_on_a_local_disk(one, model, tmp_path, out, monkeypatch):
     """ffmpeg moves the index of a finished video to its start, which network storage does slowly."""
     written = []
     original = trip.process_video
@@ -101,12 +97,11 @@ def test_videos_are_written_on_a_local_disk(one, model, tmp_path, monkeypatch):
         return original(source, target, *words, **options)
 
     monkeypatch.setattr(trip, "process_video", process_video)
-    run(one, tmp_path / "out", model)
+    run(one, out, model)
     assert written[0].is_relative_to(tmp_path / "scratch")
 
 
-def test_folders_that_cannot_be_read_are_errors(one, model, tmp_path, monkeypatch):
-    out = tmp_path / "out"
+def test_folders_that_cannot_be_read_are_errors(one, model, out, monkeypatch):
     out.mkdir()
     (out / "records").mkdir()
 
@@ -151,8 +146,7 @@ def signed(clip):
         yield server
 
 
-def test_signed_urls_are_the_same_files_when_they_are_signed_again(signed, model, tmp_path):
-    out = tmp_path / "out"
+def test_signed_urls_are_the_same_files_when_they_are_signed_again(signed, model, out):
     names = ("081500", "081501", "093000")
     assert counts(run([signed.url(name, "ab12") for name in names], out, model, tracks_only=True)) == (
         2, 0, 0, 0
@@ -178,19 +172,19 @@ def test_signed_urls_are_the_same_files_when_they_are_signed_again(signed, model
         assert b"cd34" not in path.read_bytes()
 
 
-def test_two_urls_of_one_file_are_processed_once(signed, model, tmp_path):
+def test_two_urls_of_one_file_are_processed_once(signed, model, out):
     urls = [signed.url(name, "ab12") for name in ("093000", "081500")]
     urls.append(f"{urls[0]}&X-Amz-Expires=60")
-    assert counts(run(urls, tmp_path / "out", model, tracks_only=True, group="file")) == (2, 0, 0, 1)
-    check_whole(tmp_path / "out", done=2, failed=0)
+    assert counts(run(urls, out, model, tracks_only=True, group="file")) == (2, 0, 0, 1)
+    check_whole(out, done=2, failed=0)
 
 
-def test_a_bad_segment_of_a_server_is_named(signed, model, tmp_path):
+def test_a_bad_segment_of_a_server_is_named(signed, model, out):
     signed.files["cam/20260131_081501_F.mp4"] = b"\0" * 3000
     urls = [signed.url(name, "ab12") for name in ("081500", "081501")]
-    report = run(urls, tmp_path / "out", model, tracks_only=True)
+    report = run(urls, out, model, tracks_only=True)
     assert counts(report) == (1, 0, 0, 0)
-    (record,) = check_whole(tmp_path / "out", done=1, failed=0).values()
+    (record,) = check_whole(out, done=1, failed=0).values()
     named = f"{signed.address}/cam/20260131_081501_F.mp4 is not a video"
     assert record["damage"].startswith(f"the last segment is left out: {named}")
 
@@ -203,12 +197,11 @@ def test_the_identity_of_a_url_does_not_depend_on_what_is_hidden_in_its_record()
     assert "secret" not in task["sources"][0]["uri"]
 
 
-def test_the_message_of_a_broken_executor_has_no_password(one, model, tmp_path):
+def test_the_message_of_a_broken_executor_has_no_password(one, model, out):
     class Broken(ThreadPoolExecutor):
         def submit(self, *_):
             raise BrokenExecutor("tcp://anna:secret@host:8786 does not answer")
 
-    out = tmp_path / "out"
     report = run_batch(one, out, Broken(1), model=model, tracks_only=True, progress=False)
     assert counts(report) == (0, 0, 1, 0)
     (message,) = report.messages.values()

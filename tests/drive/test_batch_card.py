@@ -13,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("private_scratch")
 FRAMES, SEGMENTS = 15, 4  # in each segment, which is a second long
 
 
-def test_a_card_of_many_segments_is_one_trip_with_one_identity_per_vehicle(tmp_path):
+def test_a_card_of_many_segments_is_one_trip_with_one_identity_per_vehicle(tmp_path, out):
     card = tmp_path / "card"
     card.mkdir()
     scenes = list(render_drive(frames=FRAMES, shape=(360, 640), scenario="traffic"))
@@ -27,7 +27,6 @@ def test_a_card_of_many_segments_is_one_trip_with_one_identity_per_vehicle(tmp_p
             write_clip(card / f"20260131_0815{segment:02}_R.mp4", mirrored, fps=FRAMES)
     trips = find_trips(card.iterdir(), duration=lambda file: probe_video(file).duration)
     assert [(trip.camera, len(trip.files)) for trip in trips] == [("front", SEGMENTS), ("rear", 2)]
-    out = tmp_path / "out"
     report = run(card, out, "default", tracks_only=True, options={"fov": 58})
     assert counts(report) == (2, 0, 0, 0)
     found = {record["camera"]: record for record in check_whole(out, done=2, failed=0).values()}

@@ -56,8 +56,7 @@ def check_numbers(printed):
     assert int(found[1]) + int(found[2]) == TRIPS - 1
 
 
-def test_a_killed_worker_is_replaced(many, model, tmp_path, start_batch):
-    out = tmp_path / "out"
+def test_a_killed_worker_is_replaced(many, model, tmp_path, out, start_batch):
     with unfinished(out, last_of(many)):
         process = start_batch(many, out, model, "--tracks-only", jobs=1)
         wait_for_records(out, 1)
@@ -71,11 +70,9 @@ def test_a_killed_worker_is_replaced(many, model, tmp_path, start_batch):
     assert "warning: " in errors
     assert "drive e.mp4 " in errors
     check_whole(out, done=TRIPS - 1, failed=1)
-    assert not list((tmp_path / "scratch").glob("*vehicle-batch*"))
 
 
-def test_a_killed_batch_is_resumed_by_the_same_command(many, model, tmp_path, start_batch):
-    out = tmp_path / "out"
+def test_a_killed_batch_is_resumed_by_the_same_command(many, model, tmp_path, out, start_batch):
     with unfinished(out, last_of(many)):
         process = start_batch(many, out, model, jobs=1)
         wait_for_records(out, 2)
@@ -86,12 +83,11 @@ def test_a_killed_batch_is_resumed_by_the_same_command(many, model, tmp_path, st
     assert run(many, out, model).skipped >= len(before)
     check_whole(out, done=TRIPS - 1, failed=1)
     assert before.items() <= files(out / "records").items(), "a trip was done twice"
-    assert not list((tmp_path / "scratch").glob("*vehicle-batch*"))
 
 
-def test_a_disk_that_is_full_in_the_middle(many, model, tmp_path):
+def test_a_disk_that_is_full_in_the_middle(many, model, tmp_path, out):
     """The first run writes to a disk of 120 kB, whose files the second one finds on a large disk."""
-    out, kept = tmp_path / "out", tmp_path / "kept"
+    kept = tmp_path / "kept"
     out.mkdir()
     mount = f"mount -t tmpfs -o size=120k tmpfs '{out}'"
     if shutil.which("unshare") is None or subprocess.run(["unshare", "-rm", "sh", "-c", mount]).returncode:
@@ -108,11 +104,9 @@ def test_a_disk_that_is_full_in_the_middle(many, model, tmp_path):
     run(many, out, model)
     after = check_whole(out, done=TRIPS - 1, failed=1)
     assert before.items() <= after.items(), "a trip was done twice"
-    assert not list((tmp_path / "scratch").glob("*vehicle-batch*"))
 
 
-def test_two_batches_on_one_folder_share_the_work(many, model, tmp_path, start_batch):
-    out = tmp_path / "out"
+def test_two_batches_on_one_folder_share_the_work(many, model, out, start_batch):
     started = [start_batch(many, out, model, "--tracks-only", jobs=1) for _ in range(2)]
     printed = [finish(process) for process in started]
     assert [code for code, _, _ in printed] == [0, 0]
@@ -121,8 +115,7 @@ def test_two_batches_on_one_folder_share_the_work(many, model, tmp_path, start_b
     assert sum(done) == TRIPS - 1
 
 
-def test_an_interrupt_ends_the_workers(many, model, tmp_path, start_batch):
-    out = tmp_path / "out"
+def test_an_interrupt_ends_the_workers(many, model, tmp_path, out, start_batch):
     with unfinished(out, last_of(many)):
         process = start_batch(many, out, model, jobs=1)
         wait_for_records(out, 1)
@@ -134,23 +127,21 @@ def test_an_interrupt_ends_the_workers(many, model, tmp_path, start_batch):
     assert re.fullmatch(r"((done|warning): .*\n)*interrupted\n", errors), errors
     assert children
     assert not any(Path(f"/proc/{child}").exists() for child in children)
-    assert not list((tmp_path / "scratch").glob("*vehicle-batch*"))
 
 
-def test_a_worker_that_dies_in_every_attempt_is_an_error(card, model, tmp_path, monkeypatch):
+def test_a_worker_that_dies_in_every_attempt_is_an_error(card, model, out, monkeypatch):
     resource_tracker.ensure_running()
     before = child_processes()
     monkeypatch.setattr("vehicle_detection.drive.batch.run_trip", kill_this_process)
-    report = run_batch(card / "20260131_093000_F.mp4", tmp_path / "out", model=model, jobs=1, progress=False)
+    report = run_batch(card / "20260131_093000_F.mp4", out, model=model, jobs=1, progress=False)
     assert counts(report) == (0, 0, 1, 0)
     assert "the worker process ended before its result, 3 times" in next(iter(report.messages.values()))
-    assert batch_status(tmp_path / "out").errors == 1
+    assert batch_status(out).errors == 1
     assert child_processes() == before
 
 
-def test_a_dask_cluster_that_loses_a_worker(many, model, tmp_path, start_batch):
+def test_a_dask_cluster_that_loses_a_worker(many, model, out, start_batch):
     pytest.importorskip("distributed")
-    out = tmp_path / "out"
     with unfinished(out, last_of(many)):
         process = start_batch(many, out, model, "--dask", "local", "--tracks-only", jobs=1)
         wait_for_records(out, 1)
@@ -163,12 +154,12 @@ def test_a_dask_cluster_that_loses_a_worker(many, model, tmp_path, start_batch):
 
 
 def test_a_killed_scheduler_ends_the_run_and_the_next_one_does_the_rest(
-    many, model, tmp_path, start, start_batch, monkeypatch
+    many, model, tmp_path, out, start, start_batch, monkeypatch
 ):
     pytest.importorskip("distributed")
     monkeypatch.setenv("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "3s")
     monkeypatch.setenv("VEHICLE_DETECTION_JOBS", "1")
-    file, out = tmp_path / "scheduler.json", tmp_path / "out"
+    file = tmp_path / "scheduler.json"
     words = ["--scheduler-file", file, "--no-dashboard"]
     scheduler = start("-m", "distributed.cli.dask_scheduler", "--port", 0, *words)
     worker = start("-m", "distributed.cli.dask_worker", *words, "--nthreads", 1, "--death-timeout", 20)

@@ -37,10 +37,10 @@ def test_records_of_another_shape_are_left_out(record, tmp_path):
     assert batch_summary(tmp_path)["key"].tolist() == ["good"]
 
 
-def test_a_record_removes_its_own_files_only(tmp_path):
-    victims = [tmp_path / "victim", tmp_path / "out" / "tracks" / "date=a" / "camera=b" / "2-2.parquet"]
+def test_a_record_removes_its_own_files_only(tmp_path, out):
+    victims = [tmp_path / "victim", out / "tracks" / "date=a" / "camera=b" / "2-2.parquet"]
     victims[1].parent.mkdir(parents=True)
-    store = open_store(tmp_path / "out")
+    store = open_store(out)
     for victim, path in zip(victims, ("tracks/../../victim", "tracks/date=a/camera=b/2-2.parquet")):
         victim.write_text("precious")
         store.write_record(
@@ -54,8 +54,8 @@ def test_a_record_removes_its_own_files_only(tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 @pytest.mark.parametrize("kind", ["link", "hard link", "pipe", "file"])
-def test_locks_and_records_of_others_are_neither_followed_nor_emptied(kind, tmp_path):
-    victim, folder = tmp_path / "victim", tmp_path / "out"
+def test_locks_and_records_of_others_are_neither_followed_nor_emptied(kind, tmp_path, out):
+    victim, folder = tmp_path / "victim", out
     victim.write_text("precious")
     for path in (folder / "locks" / "1.lock", folder / "records" / "1-1.json"):
         path.parent.mkdir(parents=True)
@@ -78,13 +78,13 @@ def test_locks_and_records_of_others_are_neither_followed_nor_emptied(kind, tmp_
     assert victim.read_text() == "precious"
 
 
-def test_a_linked_folder_in_the_results_is_refused(tmp_path):
+def test_a_linked_folder_in_the_results_is_refused(tmp_path, out):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "a.json").write_text("precious")
     (tmp_path / "real").mkdir()
-    (tmp_path / "out").symlink_to(tmp_path / "real")  # the folder itself may be a link
-    (tmp_path / "out" / "records").symlink_to(tmp_path / "elsewhere")
-    store = open_store(tmp_path / "out")
+    out.symlink_to(tmp_path / "real")  # the folder itself may be a link
+    (out / "records").symlink_to(tmp_path / "elsewhere")
+    store = open_store(out)
     for call in (lambda: store.remove("records/a.json"), lambda: store.put("records/a.json", b""),
                  lambda: store.list_files("records"), lambda: store.read("records/a.json")):  # fmt: skip
         with pytest.raises(OutputError, match="leads through a link"):
