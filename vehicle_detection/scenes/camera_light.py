@@ -180,9 +180,8 @@ class SceneView(fields.Checked):
     camera_height_m: float = fields.number(1.3, low=0.5, high=5)
     focal_px: float | None = None  # None: 0.9 times the longer side
     light: str = fields.choice("day", LIGHTS)
-    rain: float = fields.number(
-        0.0, low=0, high=1
-    )  # 0 (dry) to 1 (heavy): streaks, haze, less contrast, more noise
+    # From 0 (dry) to 1 (heavy): streaks, haze, less contrast, more noise.
+    rain: float = fields.number(0.0, low=0, high=1)
     jpeg_quality: int | None = fields.integer(None, low=1, high=100)
 
     def configure(self, rng: Rng) -> SceneConfig:

@@ -34,15 +34,13 @@ class SceneVehicle(fields.Checked):
     """A vehicle to place in a scene; `kind` and `color` are random if they are None."""
 
     distance_m: float = fields.number(low=2, high=1000)  # along the road to the nearer tires
-    lateral_m: float = fields.number(
-        0.0, low=-100, high=100
-    )  # of its middle, to the right; a lane is 3.6 m wide
+    # Of its middle, to the right; a lane is 3.6 m wide.
+    lateral_m: float = fields.number(0.0, low=-100, high=100)
     kind: str | None = fields.choice(None, VEHICLE_SHAPES)  # hatchback, estate, sedan, mpv, suv, van or truck
     color: str | None = fields.choice(None, COLORS)
     view: str = fields.choice("rear", ("rear", "front"))  # the end that the camera sees
-    speed_mps: float = fields.number(
-        0.0, low=-150, high=150
-    )  # away from the camera; only for the ground truth
+    # Away from the camera; only for the ground truth.
+    speed_mps: float = fields.number(0.0, low=-150, high=150)
 
 
 @dataclass(frozen=True, eq=False)
