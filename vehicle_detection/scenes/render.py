@@ -115,10 +115,19 @@ def composite(
 
 
 def draw_vehicle(image: Image | None, config: SceneConfig, pose: VehiclePose) -> Sprite | None:
-    """Draw a single vehicle into `image`, if given, in place and return it; None if it is outside."""
+    """Draw a single vehicle into `image`, if given, in place and return it; None if it is outside.
+
+    It has a shadow and lamps, and its lens blur and haze grow with the distance.
+    """
     sprite = draw_sprite(pose, config)
     if sprite is not None and image is not None:
-        _draw_into(image, config, pose, sprite)
+        _draw_shadow(image, config, pose)
+        light, distance = config.light, max(pose.distance, 0.0)
+        sigma = (0.2 + 0.004 * min(distance, 60.0)) * max(1.0, config.camera.focal_px / 1152)
+        rgba = np.asarray(cv2.GaussianBlur(sprite.rgba, (0, 0), sigma), np.float32)
+        draw_layer(image[sprite.region], rgba, light, distance, offset=0.5)
+        if light.lamps > 0.3 and pose.distance > 2.5:
+            _draw_glow(image, config, pose)
     return sprite
 
 
@@ -322,17 +331,6 @@ def _draw_end(buffer: _SpriteBuffer, pose: VehiclePose, surface: Surface, start:
             depth = cv2.remap(surface.depth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             ahead = np.asarray(np.float32(start) + depth, np.float32)
     buffer.composite(columns, cv2.remap(rgba, *surface_pixels(across, upwards), cv2.INTER_LINEAR))
-
-
-def _draw_into(image: Image, config: SceneConfig, pose: VehiclePose, sprite: Sprite) -> None:
-    """Draw a sprite with shadow and lamps into the image; lens blur and haze grow with the distance."""
-    _draw_shadow(image, config, pose)
-    light, distance = config.light, max(pose.distance, 0.0)
-    sigma = (0.2 + 0.004 * min(distance, 60.0)) * max(1.0, config.camera.focal_px / 1152)
-    rgba = np.asarray(cv2.GaussianBlur(sprite.rgba, (0, 0), sigma), np.float32)
-    draw_layer(image[sprite.region], rgba, light, distance, offset=0.5)
-    if light.lamps > 0.3 and pose.distance > 2.5:
-        _draw_glow(image, config, pose)
 
 
 def _draw_shadow(image: Image, config: SceneConfig, pose: VehiclePose) -> None:

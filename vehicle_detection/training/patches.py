@@ -174,6 +174,8 @@ def train_and_evaluate(
             return trained if part is None else trained.decision_function(features[part.test])
 
         running = [pool.submit(_timed, partial(fit, part)) for _, part in fits]
+        for future in running:
+            future.add_done_callback(lambda _: bar.update())
         try:
             leakage, seconds["leakage"] = _timed(
                 lambda: {name: split_leakage(patch_set, listed[0]) for name, listed in splits.items()}
@@ -182,7 +184,6 @@ def train_and_evaluate(
                 result, spent = future.result()
                 found[name].append(result)
                 seconds[name] += spent
-                bar.update()
         finally:
             pool.shutdown(cancel_futures=True)
     (classifier,), error = found["final"], None
