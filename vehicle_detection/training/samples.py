@@ -89,16 +89,13 @@ class Sampler:
         boxes = np.concatenate([boxes, added], axis=1)
         image = self._warp(rows, views)
         for i in range(_COVERS):
-            image = self._paint(image, covers[:, i], self._random_colors(count, rng))
+            # A third of the colors are dark.
+            colors = rng.uniform(0, 255, (count, 3)) * np.where(rng.random((count, 1)) < 0.3, 0.25, 1.0)
+            image = self._paint(image, covers[:, i], self._tensor(colors)[:, :, None, None])
         image = self._paint(image, parts, image.roll(1, 0))
         image = self._change_light(image, rng).round_().clamp_(0, 255).byte().permute(0, 2, 3, 1)
         (vehicles, exists), (ignored, _) = (_compact(boxes, kinds == kind) for kind in (VEHICLE, IGNORED))
         return image, Targets(self._tensor(vehicles), self._tensor(exists), self._tensor(ignored))
-
-    def _random_colors(self, count: int, rng: Rng) -> Tensor:
-        """Draw colors, a third of them dark."""
-        colors = rng.uniform(0, 255, (count, 3)) * np.where(rng.random((count, 1)) < 0.3, 0.25, 1.0)
-        return self._tensor(colors)[:, :, None, None]
 
     def _tensor(self, values: NDArray[np.generic]) -> Tensor:
         """Copy an array to the device, floats as float32."""
