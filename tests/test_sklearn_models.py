@@ -31,12 +31,6 @@ def labels():
     return render_patches(80, random_state=1)[1]
 
 
-def assert_same_scores(classifier, pipeline, rows):
-    """Up to the precision of float32."""
-    expected = pipeline.decision_function(rows)
-    np.testing.assert_allclose(classifier.decision_function(rows), expected, rtol=1e-4, atol=1e-4)
-
-
 def published_features(patches, size=8):
     """Features of patches with the spatial bins in the order of ``cv2.resize(image, size).ravel()``."""
     params = dataclasses.replace(SMALL, spatial_feat=False)
@@ -88,7 +82,8 @@ def test_a_grid_search_over_the_features(patches, labels):
     search = GridSearchCV(make_pipeline(*steps), grid, cv=2).fit(patches, labels)
     classifier = VehicleClassifier.from_pipeline(search)
     assert classifier.params == dataclasses.replace(SMALL, orient=5, spatial_order="interleaved")
-    assert_same_scores(classifier, search, patches)
+    expected = search.decision_function(patches)
+    np.testing.assert_allclose(classifier.decision_function(patches), expected, rtol=1e-4, atol=1e-4)
     gained = dataclasses.replace(classifier.params, hist_gain=2)
     assert VehicleClassifier.from_pipeline(search, gained).params == gained
     with pytest.raises(InvalidInputError, match="params must equal those of the pipeline"):

@@ -150,8 +150,7 @@ training.train_and_evaluate = train
 
 def fill_after(monkeypatch, number):
     """Fill the disk at the rename of an output."""
-    count = itertools.count(1)
-    replace = Path.replace
+    count, replace = itertools.count(1), Path.replace
 
     def fill(self, target):
         if next(count) == number:

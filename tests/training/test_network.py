@@ -28,11 +28,6 @@ def train(frames, training=TRAINING, **options):
     return train_network(frames, training, device="cpu", jobs=1, **options).state_dict()
 
 
-def assert_equal(one, other):
-    for name, value in one.items():
-        assert torch.equal(value, other[name]), name
-
-
 class StopError(Exception):
     pass
 
@@ -49,7 +44,8 @@ def test_a_resumed_training_equals_an_uninterrupted_one(frames, tmp_path):
         train(frames, checkpoint=checkpoint, on_step=interrupt)
     resumed = train(frames, checkpoint=checkpoint, on_step=interrupt)
     assert steps == [1, 2, 3, 3, 4]  # the third step was interrupted before its checkpoint
-    assert_equal(train(frames), resumed)
+    for name, value in train(frames).items():
+        assert torch.equal(value, resumed[name]), name
 
 
 def test_the_global_generator_stays_as_it_is(frames):

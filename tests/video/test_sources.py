@@ -355,9 +355,11 @@ def stream(clip):
 def test_standard_input_waits_for_the_search(tmp_path):
     """Its anamorphic frames have square pixels in the video, like those of files."""
     stream = write_clip(tmp_path / "wide.ts", gray_frames(20), options=["-vf", "setsar=4/3"]).read_bytes()
+    raw = write_clip(tmp_path / "raw.mjpeg", gray_frames(3), options=RAW[0][1]).read_bytes()
     command = [sys.executable, "-c", FROM_STDIN, tmp_path / "out.mp4"]
-    done = subprocess.run(command, input=stream, capture_output=True, check=True)
-    assert done.stdout == b"20\n"
+    for data, frames, told in ((raw, b"3\n", b"no frame rate: 25 is assumed"), (stream, b"20\n", b"")):
+        done = subprocess.run(command, input=data, capture_output=True, check=True)
+        assert (done.stdout, told in done.stderr) == (frames, True)
     assert frame_numbers(tmp_path / "out.mp4") == list(range(20))
     assert probe_video(tmp_path / "out.mp4").shape == (48, 86, 3)
 
