@@ -51,24 +51,16 @@ def check_switch(value: Any, name: str) -> bool:
     return bool(value)
 
 
-def _one_of(choices: tuple[str, ...]) -> Callable[[Any, str], Any]:
-    def checked(value: Any, name: str) -> Any:
-        check.choice(value, name, choices)
-        return value
-
-    return checked
-
-
 # Check and initial value of each option of `set_lesson_defaults`.
 _OPTIONS: dict[str, tuple[Callable[[Any, str], Any], Any]] = {
     "transform_sqrt": (check_switch, False),
-    "formula": (_one_of(FORMULAS), "old"),
-    "imread": (_one_of(READERS), "mpimg"),
-    "channel_order": (_one_of(CHANNEL_ORDERS), "RGB"),
+    "formula": (functools.partial(check.choice, choices=FORMULAS), "old"),
+    "imread": (functools.partial(check.choice, choices=READERS), "mpimg"),
+    "channel_order": (functools.partial(check.choice, choices=CHANNEL_ORDERS), "RGB"),
     "hist_range": (check_range, (0, 256)),
-    "spatial_order": (_one_of(SPATIAL_ORDERS), "interleaved"),
-    "find_cars_returns": (_one_of(RETURNS), "picture"),
-    "find_cars_formula": (_one_of(FORMULAS), "old"),
+    "spatial_order": (functools.partial(check.choice, choices=SPATIAL_ORDERS), "interleaved"),
+    "find_cars_returns": (functools.partial(check.choice, choices=RETURNS), "picture"),
+    "find_cars_formula": (functools.partial(check.choice, choices=FORMULAS), "old"),
     "cells_per_step": (lambda value, name: check.integer(value, name, low=1), 2),
     "divide_by": (lambda value, name: check.number(value, name, above=0), 255),
 }

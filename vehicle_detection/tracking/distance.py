@@ -230,17 +230,10 @@ def _correct_by_growth(
     logarithm, std = growth.T
     far = mean[:, DISTANCE] + camera.overhang_m / 2
     before = np.maximum(far - dt * mean[:, SPEED], 0.1 * far)
-    jacobian = np.zeros_like(mean)
-    jacobian[:, DISTANCE], jacobian[:, SPEED] = 1 / before - 1 / far, -dt / before
-    shared = np.square(_GROWTH_BIAS * dt) * max(1.0, _SHARED_TIME / dt)
+    slopes = {DISTANCE: 1 / before - 1 / far, SPEED: -dt / before}
+    variance = np.square(std) + np.square(_GROWTH_BIAS * dt) * max(1.0, _SHARED_TIME / dt)
     known = np.isfinite(std) & (cov[:, DISTANCE, DISTANCE] < _INITIAL_DISTANCE_STD**2 / 2)
-    return _scalar_update(
-        mean,
-        cov,
-        jacobian,
-        logarithm - np.log(before / far),
-        np.where(known, np.square(std) + shared, np.inf),
-    )
+    return _scalar_update(mean, cov, slopes, logarithm - np.log(before / far), variance, known)
 
 
 def _correct_by_bottom(mean: Floats, cov: Floats, view: _View, camera: Camera) -> tuple[Floats, Floats]:
@@ -254,16 +247,11 @@ def _correct_by_bottom(mean: Floats, cov: Floats, view: _View, camera: Camera) -
     def correct(at: Floats) -> tuple[Floats, Floats]:
         tires = at + camera.overhang_m
         log_ratio, tangent_px = _log_by_tangent(view.below_horizon, camera.focal_px * camera.height_m / tires)
-        jacobian = np.zeros_like(mean)
-        jacobian[:, DISTANCE], jacobian[:, HORIZON], jacobian[:, CAMERA_HEIGHT] = (
-            -1 / tires,
-            1 / tangent_px,
-            1,
-        )
+        slopes = {DISTANCE: -1 / tires, HORIZON: 1 / tangent_px, CAMERA_HEIGHT: 1}
         innovation = log_ratio - (at - mean[:, DISTANCE]) / tires - mean[:, CAMERA_HEIGHT]
         shared = np.square(view.oncoming * _ONCOMING_BOTTOM_STD) + np.square(camera.overhang_std_m / tires)
         variance = np.square(view.edge_std[:, 1] / tangent_px) * view.box_frames + shared * view.shared_frames
-        return _scalar_update(mean, cov, jacobian, innovation, np.where(view.sees_bottom, variance, np.inf))
+        return _scalar_update(mean, cov, slopes, innovation, variance, view.sees_bottom)
 
     # Far away, noise dominates the correction, so that the predicted distance is more exact.
     predicted = mean[:, DISTANCE]
@@ -279,8 +267,7 @@ def _correct_by_width(
     The error of the length is included to first order.
     """
     width, side = view.sides[:, 0], view.lateral_px / view.width_scale
-    jacobian = np.zeros_like(mean)
-    jacobian[:, DISTANCE], jacobian[:, WIDTH], jacobian[:, LENGTH] = -1 / mean[:, DISTANCE], 1, side
+    slopes = {DISTANCE: -1 / mean[:, DISTANCE], WIDTH: 1, LENGTH: side}
     expected = mean[:, WIDTH] + side * mean[:, LENGTH] - np.log(mean[:, DISTANCE])
     innovation = np.log(width / view.width_scale) - expected
     # Detectors cut the long sides of vehicles short, where the whole box would be wider than usual.
@@ -294,7 +281,7 @@ def _correct_by_width(
     # Both edges are measured with the same error.
     variance = 2 * np.square(view.edge_std[:, 0] / width) * view.box_frames + shared * view.shared_frames
     informs = view.sees_width & ~(view.is_bound & (innovation < 0))
-    return _scalar_update(mean, cov, jacobian, innovation, np.where(informs, variance, np.inf))
+    return _scalar_update(mean, cov, slopes, innovation, variance, informs)
 
 
 def _correct_by_height(mean: Floats, cov: Floats, view: _View, camera: Camera) -> tuple[Floats, Floats]:
@@ -304,14 +291,14 @@ def _correct_by_height(mean: Floats, cov: Floats, view: _View, camera: Camera) -
     theory of visual control of braking based on information about time-to-collision", *Perception*, 1976).
     """
     tires = mean[:, DISTANCE] + camera.overhang_m
-    jacobian = np.zeros_like(mean)
-    jacobian[:, DISTANCE], jacobian[:, HEIGHT] = -1 / tires, 1
     scale = camera.focal_px * camera.vehicle_height_m
     innovation = np.log(view.sides[:, 1] * tires / scale) - mean[:, HEIGHT]
     shared = np.square(camera.overhang_std_m / tires)
     height_std = view.edge_std[:, 1] / view.sides[:, 1]
     variance = 2 * np.square(height_std) * view.box_frames + shared * view.shared_frames
-    return _scalar_update(mean, cov, jacobian, innovation, np.where(view.sees_height, variance, np.inf))
+    return _scalar_update(
+        mean, cov, {DISTANCE: -1 / tires, HEIGHT: 1}, innovation, variance, view.sees_height
+    )
 
 
 def _log_by_tangent(pixels: Floats, expected: Floats) -> tuple[Floats, Floats]:
@@ -325,15 +312,18 @@ def _log_by_tangent(pixels: Floats, expected: Floats) -> tuple[Floats, Floats]:
 
 
 def _scalar_update(
-    mean: Floats, cov: Floats, jacobian: Floats, innovation: Floats, variance: Floats
+    mean: Floats, cov: Floats, slopes: dict[int, Any], innovation: Floats, variance: Floats, seen: Bools
 ) -> tuple[Floats, Floats]:
-    """Correct each state by one scalar measurement; an infinite variance changes nothing.
+    """Correct the states for which a scalar measurement is `seen`, given its slopes by column of the state.
 
-    `mean` and `jacobian` are ``(N, 7)``, `cov` ``(N, 7, 7)``, `innovation` and `variance` ``(N,)``. With one
-    measurement the innovation's covariance ``h P h' + r`` is a number, so that no matrix is inverted. The
-    variance `r` of an outlier is increased by the square of its innovation in units of `_OUTLIER` standard
-    errors (Huber's weights).
+    `mean` is ``(N, 7)``, `cov` ``(N, 7, 7)``, `innovation` and `variance` ``(N,)``. With one measurement the
+    innovation's covariance ``h P h' + r`` is a number, so that no matrix is inverted. The variance `r` of an
+    outlier is increased by the square of its innovation in units of `_OUTLIER` standard errors (Huber's
+    weights); an infinite one changes nothing.
     """
+    jacobian, variance = np.zeros_like(mean), np.where(seen, variance, np.inf)
+    for column, slope in slopes.items():
+        jacobian[:, column] = slope
     cross = (cov @ jacobian[:, :, None])[:, :, 0]  # P h'
     expected = (jacobian * cross).sum(axis=1)  # h P h'
     penalty = np.maximum(np.square(innovation) / (expected + variance) / _OUTLIER**2, 1.0)
