@@ -180,10 +180,12 @@ class BirdsEyePanel:
         positions = {track.id: road_position(track, camera, shape) for track in tracks}
         points = {key: position and self._point(*position[:2]) for key, position in positions.items()}
         self._update_trails(time, points)
-        shown = [
+        shown = [  # the vehicles that lie in the view as a whole
             (position, track, color)
             for track, color in zip(tracks, colors, strict=True)
-            if (position := positions[track.id]) is not None and self._holds(position, camera)
+            if (position := positions[track.id]) is not None
+            and position.distance_m + camera.vehicle_length_m <= _AHEAD_M
+            and abs(position.lateral_m) + camera.vehicle_width_m / 2 <= self._width / 2 / self._scale
         ]
         # Far to near, and all ellipses below all vehicles.
         shown.sort(key=lambda entry: -entry[0].distance_m)
@@ -196,12 +198,6 @@ class BirdsEyePanel:
         if self._has_text:
             self._write_numbers(view, [(position, track.id) for position, track, _ in shown], camera)
         return left, 0, left + width, height
-
-    def _holds(self, position: RoadPosition, camera: Camera) -> bool:
-        """Whether a vehicle lies in the view as a whole."""
-        side = abs(position.lateral_m) + camera.vehicle_width_m / 2
-        ahead = position.distance_m + camera.vehicle_length_m
-        return ahead <= _AHEAD_M and side <= self._width / 2 / self._scale
 
     def _update_trails(self, time: float, points: Mapping[int, Point | None]) -> None:
         """Add the points of a frame, at most one per 0.08 s and track."""

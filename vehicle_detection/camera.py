@@ -472,19 +472,16 @@ def _read_values(path: Path) -> dict[str, Any]:
     data = read_regular_file(path, f"camera file {path}", Limit.TEXT_BYTES)
     kind = _CALIBRATIONS.get(path.suffix.lower(), "JSON")
     try:
-        parse = {"YAML": _parse_yaml, "XML": _parse_xml}.get(kind, json.loads)
-        values: Any = parse(data.decode("utf-8-sig"))
+        text = data.decode("utf-8-sig")
+        if kind == "YAML":  # without the first line and the tags of OpenCV
+            text = re.sub(r"^%YAML:.*|!!opencv-matrix", "", text)
+        values: Any = {"YAML": parse_yaml, "XML": _parse_xml}.get(kind, json.loads)(text)
     except (ValueError, RecursionError) as error:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else error
         raise InvalidInputError(f"camera file {path} is not {kind}: {reason}; see read_camera") from None
     if not isinstance(values, dict):
         raise invalid(f"camera file {path}", "be an object with the names of read_camera", values)
     return values
-
-
-def _parse_yaml(text: str) -> Any:
-    """Parse YAML of ROS, or of OpenCV, whose first line and tags are its own."""
-    return parse_yaml(re.sub(r"^%YAML:.*|!!opencv-matrix", "", text))
 
 
 def _parse_xml(text: str) -> dict[str, Any]:

@@ -50,15 +50,11 @@ def color_index(track_id: int) -> int:
 
 def track_color(track: Track, color_by: Literal["id", "distance"] = "id") -> Color:
     """RGB color of a track, chosen by its id or its distance; gray for a tentative track."""
-    if color_by == "distance":
-        return _distance_color(track.distance_m)
-    return TRACK_COLORS[color_index(track.id)] if track.id > 0 else _UNKNOWN_COLOR
-
-
-def _distance_color(distance_m: float | None) -> Color:
-    if distance_m is None:
+    if color_by == "id":
+        return TRACK_COLORS[color_index(track.id)] if track.id > 0 else _UNKNOWN_COLOR
+    if track.distance_m is None:
         return _UNKNOWN_COLOR
-    position = math.log(max(distance_m, _DISTANCES[0]))
+    position = math.log(max(track.distance_m, _DISTANCES[0]))
     red, green, blue = (
         round(float(np.interp(position, np.log(_DISTANCES), values))) for values in zip(*_DISTANCE_COLORS)
     )
@@ -260,8 +256,9 @@ class LabelPlacer:
                 found = _free_place(places, obstacles, before, margin)
                 if found is not None:
                     break
-            else:
-                found = _least_hiding(places, obstacles, before)
+            else:  # the place that hides least, where the last one counts less; the best one of equals
+                weights = {before: _LAST_WEIGHT}
+                found = min(places, key=lambda at: hidden_area(at[1], obstacles) * weights.get(at[0], 1.0))
             place, rectangle = found
             labels.append(Label(lines, rectangle, fitted, _leader(request.box, rectangle)))
             last[request.key] = count, len(lines), place
@@ -296,15 +293,6 @@ def _free_place(
         if not any(_intersect(rectangle, other, space) for other in obstacles):
             return place, rectangle
     return None
-
-
-def _least_hiding(places: Iterable[Place], obstacles: Sequence[Rectangle], last: int | None) -> Place:
-    """Return the place that hides least, where the last one counts less."""
-
-    def hidden(place: Place) -> float:
-        return hidden_area(place[1], obstacles) * (_LAST_WEIGHT if place[0] == last else 1.0)
-
-    return min(places, key=hidden)  # the first one of equals, the best
 
 
 def _places(box: Rectangle, size: tuple[int, int], shape: tuple[int, ...]) -> Iterator[Place]:
@@ -506,9 +494,12 @@ def blur_boxes(
         left, top = max(int(np.floor(x1)), 0), max(int(np.floor(y1)), 0)
         right, bottom = min(int(np.ceil(x2)), width), min(int(np.ceil(y2)), height)
         if right > left and bottom > top:
-            view = result[top:bottom, left:right]
-            cell = max(x2 - x1, y2 - y1, 1.0) / _CELLS[region]
-            view[:] = _average_cells(view, cell)
+            view, cell = result[top:bottom, left:right], max(x2 - x1, y2 - y1, 1.0) / _CELLS[region]
+            sides = right - left, bottom - top
+            cells = tuple(min(max(round(side / cell), 1), side) for side in sides)
+            # Average square cells, and interpolate between them.
+            small = cv2.resize(view, cells, interpolation=cv2.INTER_AREA)
+            view[:] = cv2.resize(small, sides, interpolation=cv2.INTER_LINEAR)
     return result
 
 
@@ -522,14 +513,6 @@ def _regions(boxes: NDArray[np.float64], region: str) -> NDArray[np.float64]:
         y = boxes[:, 1:2] + np.array(_PLATE_ROWS) * sides[:, 1:]
         boxes = np.stack([x[:, 0], y[:, 0], x[:, 1], y[:, 1]], axis=1)
     return boxes + _MARGIN * np.tile(sides, 2) * (-1, -1, 1, 1)
-
-
-def _average_cells(view: NDArray[np.uint8], cell: float) -> NDArray[np.uint8]:
-    """Average square cells of an image, and interpolate between them."""
-    height, width = view.shape[:2]
-    size = tuple(min(max(round(side / cell), 1), side) for side in (width, height))
-    cells = cv2.resize(view, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.resize(cells, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
 # Colors of cells that speak for and against a vehicle, and opacity of the one with the largest share.

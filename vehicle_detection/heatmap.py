@@ -249,16 +249,12 @@ def bounding_boxes(shape: tuple[int, ...], windows: Any, *, params: HeatParams |
     return label_heat(frame_heat(shape, windows, params), params)
 
 
-def heat_threshold(params: HeatParams) -> float:
-    """Threshold of the parameters; None means that for the windows of a classifier's default search."""
-    if params.threshold is None:
-        return heat_range(SearchParams.default(), params).default
-    return params.threshold
-
-
 def label_heat(heatmap: NDArray[Any], params: HeatParams) -> Detections:
-    """Boxes of a heat map, see `label_boxes`, with the threshold and peak fraction of `params`."""
-    return label_boxes(heatmap, threshold=heat_threshold(params), peak_fraction=params.peak_fraction)
+    """Boxes of a heat map as of `label_boxes`; without a threshold that of a classifier's default search."""
+    threshold = params.threshold
+    if threshold is None:
+        threshold = heat_range(SearchParams.default(), params).default
+    return label_boxes(heatmap, threshold=threshold, peak_fraction=params.peak_fraction)
 
 
 def frame_heat(shape: tuple[int, ...], windows: Detections, params: HeatParams) -> NDArray[np.float32]:

@@ -59,16 +59,13 @@ def write_model(
     header = {"format": FORMAT, "format_version": FORMAT_VERSION, "kind": kind}
     header |= {"params": json.dumps(dict(params), sort_keys=True), "metadata": metadata_json}
     header["sha256"] = checksum(header, tensors)
-    with atomic_write(path, "path") as part:
-        part.write_bytes(_with_sorted_header(save(dict(tensors), metadata=header)))
-
-
-def _with_sorted_header(data: bytes) -> bytes:
-    """Sort the header's keys: safetensors writes the metadata in random order."""
+    data = save(dict(tensors), metadata=header)
+    # Sort the keys of the header: safetensors writes the metadata in random order.
     stop = 8 + int.from_bytes(data[:8], "little")
-    header = json.dumps(json.loads(data[8:stop]), sort_keys=True, separators=(",", ":")).encode()
-    header += b" " * (-len(header) % 8)
-    return len(header).to_bytes(8, "little") + header + data[stop:]
+    ordered = json.dumps(json.loads(data[8:stop]), sort_keys=True, separators=(",", ":")).encode()
+    ordered += b" " * (-len(ordered) % 8)
+    with atomic_write(path, "path") as part:
+        part.write_bytes(len(ordered).to_bytes(8, "little") + ordered + data[stop:])
 
 
 def checksum(header: Mapping[str, str], tensors: Tensors) -> str:

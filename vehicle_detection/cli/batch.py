@@ -66,14 +66,6 @@ class BatchOptions:
     summary: Path | None = option(None, "FILE.csv", "Table with a row for each trip that has been done.")
     quiet: bool = flag("-q", "Print errors only.", "--quiet")
 
-    def detector_options(self) -> dict[str, Any]:
-        """Options of the detector that are given."""
-        options: dict[str, Any] = {"classes": parse_classes(self.classes)}
-        options |= {name: getattr(self, name) for name in _DETECTOR_OPTIONS}
-        if self.device != "cpu":
-            options["device"] = self.device
-        return {name: value for name, value in options.items() if value is not None}
-
 
 @option_names(out="--output", retry_failed="--retry-failed", dry_run="--dry-run", height_m="--camera-height")
 @takes(BatchOptions)
@@ -93,7 +85,12 @@ def batch(options: BatchOptions) -> None:
     done = _run(options, options.sources)
     if options.dry_run:
         for trip in done.planned or ():
-            _print_trip(trip)
+            start = (trip["start"] or "unknown start").replace("T", " ")
+            files = common.pluralize(len(trip["files"]), "file")
+            first = common.encodable(common.hide_credentials(trip["files"][0]))
+            results = common.pluralize(len(trip["replaces"]), "earlier result")
+            replaced = f", replaces {results}" if trip["replaces"] else ""
+            print_line(f"{start}  {trip['camera']}  {files} from {first}{replaced}")
         print_line(str(done))
         return
     _write_summary(output, summary)
@@ -108,6 +105,9 @@ def batch(options: BatchOptions) -> None:
 
 def _run(options: BatchOptions, sources: list[str]) -> Any:
     """Process the trips of the sources, on a Dask cluster if one is named."""
+    detector: dict[str, Any] = {name: getattr(options, name) for name in _DETECTOR_OPTIONS}
+    detector |= {"classes": parse_classes(options.classes)}
+    detector |= {} if options.device == "cpu" else {"device": options.device}
     with contextlib.ExitStack() as stack:
         executor = None
         if options.dask is not None and not options.dry_run:
@@ -122,7 +122,7 @@ def _run(options: BatchOptions, sources: list[str]) -> Any:
             sources,
             options.output,
             executor,
-            options=options.detector_options(),
+            options={name: value for name, value in detector.items() if value is not None},
             audio=not options.no_audio,
             progress=shown,
             on_record=functools.partial(_print_record, done=shown and not sys.stderr.isatty()),
@@ -140,16 +140,6 @@ def _print_record(record: Mapping[str, Any], *, done: bool) -> None:
         elif done:
             name = common.encodable(common.hide_credentials(source))
             print_error(f"done: {name}, {common.pluralize(record['frames'], 'frame')}")
-
-
-def _print_trip(trip: Mapping[str, Any]) -> None:
-    """Print a trip that would be processed: its start, camera and files."""
-    start = (trip["start"] or "unknown start").replace("T", " ")
-    files = common.pluralize(len(trip["files"]), "file")
-    first = common.encodable(common.hide_credentials(trip["files"][0]))
-    results = common.pluralize(len(trip["replaces"]), "earlier result")
-    replaced = f", replaces {results}" if trip["replaces"] else ""
-    print_line(f"{start}  {trip['camera']}  {files} from {first}{replaced}")
 
 
 def _write_summary(output: str, summary: Path | None) -> None:

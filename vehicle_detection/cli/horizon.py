@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import vehicle_detection as vd
-from vehicle_detection.cli import common
 from vehicle_detection.cli.output import print_error, print_line
 
 if TYPE_CHECKING:
@@ -35,15 +34,6 @@ def warn_of_horizon(given: str, found: vd.tracking.HorizonEstimate | None) -> No
             f"{found.horizon:.2f}; use --horizon {found.horizon:.2f}"
         )
     print_error(f"warning: no vehicle was found with {given}{rest}")
-
-
-def parse_horizon(text: str) -> float:
-    """Return the horizon that the option states as a fraction."""
-    try:
-        return float(text)
-    except ValueError:
-        expected = "be a fraction of the frame's height, such as 0.55, or auto"
-        raise common.invalid("--horizon", expected, text) from None
 
 
 def with_found_horizon(

@@ -181,7 +181,13 @@ class VideoOptions:
 
     def stated_horizon(self) -> float | None:
         """Return the horizon that the option states; None if it states none, or is to be estimated."""
-        return None if self.horizon in (None, "auto") else rows.parse_horizon(str(self.horizon))
+        if self.horizon is None or self.horizon == "auto":
+            return None
+        try:
+            return float(self.horizon)
+        except ValueError:
+            expected = "be a fraction of the frame's height, such as 0.55, or auto"
+            raise common.invalid("--horizon", expected, self.horizon) from None
 
     def draw_params(self) -> vd.DrawParams:
         """Parameters of the annotations."""

@@ -107,10 +107,9 @@ def _list_windows(image: NDArray[np.uint8]) -> NDArray[np.int64]:
     params = SearchParams.preset("130-windows")
     windows = []
     for band in params.bands:
-        rows = [720 * params.horizon + side for side in band.y]
-        columns = [REFERENCE_WIDTH * side for side in band.x]
-        placed = (_scale(pair, image) for pair in (columns, rows, band.window))
-        windows.append(slide_window(image, *placed, band.overlap, formula="old"))
+        ends = [REFERENCE_WIDTH * side for side in band.x], [720 * params.horizon + side for side in band.y]
+        x, y, size = (_scale(pair, image) for pair in (*ends, band.window))
+        windows.append(slide_window(image, x, y, size, band.overlap, formula="old"))
     height, width = image.shape[:2]
     return np.minimum(np.concatenate(windows).reshape(-1, 4), (width, height, width, height))
 

@@ -127,7 +127,10 @@ def search_windows(
             np.asarray(cv2.resize(image[y1:y2, x1:x2], (PATCH_SIZE, PATCH_SIZE)))
             for x1, y1, x2, y2 in corners[start : start + _CHUNK]
         ]
-        hits = _classify_patches(patches, estimators)
+        if estimators.classifier is not None and options.has_library_range and are_uint8_patches(patches):
+            hits = estimators.classifier.decision_function(np.stack(patches)) > 0
+        else:
+            hits = estimators.predict(np.array(options.compute(patches)))
         found += [rows[start + index] for index in np.flatnonzero(hits)]
     return found
 
@@ -348,14 +351,6 @@ def _fast_scores(converted: Image, options: FeatureOptions, filters: BandFilters
     return filters.score_images(source, converted, hist, tables)
 
 
-def _classify_patches(patches: list[Image], estimators: _Estimators) -> NDArray[np.bool_]:
-    """Whether the classifier predicts 1 for each of some 64x64 patches."""
-    options, classifier = estimators.options, estimators.classifier
-    if classifier is not None and options.has_library_range and are_uint8_patches(patches):
-        return np.asarray(classifier.decision_function(np.stack(patches)) > 0)
-    return estimators.predict(np.array(options.compute(patches)))
-
-
 @dataclass(frozen=True)
 class _Estimators:
     """A classifier and its scaler, checked for some features."""
@@ -394,17 +389,13 @@ def _check_estimators(clf: Any, scaler: Any, options: FeatureOptions, image: Ima
     if known and clf is not None and "predict" not in vars(clf):
         state = [type(clf), type(scaler)]
         state += [getattr(each, name, None) for each in (clf, scaler) for name in _MODEL_STATE]
-    found = _last
-    if found is None or found.options != options or not _is_same_state(found.state, state):
+    found, before = _last, None if _last is None or _last.options != options else _last.state
+    if found is None or before is None or state is None or not all(map(np.array_equal, before, state)):
         found = _last = _read_estimators(clf, scaler, options, copy.deepcopy(state))
     elif found.clf is not clf or found.scaler is not scaler:
         found = dataclasses.replace(found, clf=clf, scaler=scaler)
     _warn_of_range(found, image)
     return found
-
-
-def _is_same_state(first: list[Any] | None, second: list[Any] | None) -> bool:
-    return first is not None and second is not None and all(map(np.array_equal, first, second))
 
 
 def _read_estimators(clf: Any, scaler: Any, options: FeatureOptions, state: list[Any] | None) -> _Estimators:
