@@ -142,10 +142,8 @@ class Detections:
         detections = detections.boxes if hasattr(getattr(detections, "boxes", None), "xyxy") else detections
         has_confidence = hasattr(detections, "confidence") or hasattr(detections, "conf")
         if not hasattr(detections, "xyxy") or not has_confidence:
-            raise InvalidInputError(
-                "detections must have the attributes xyxy, and confidence or conf, got "
-                f"{describe(detections)}; pass a supervision.Detections, whose confidence may be None"
-            )
+            remedy = "pass a supervision.Detections, whose confidence may be None"
+            raise invalid("detections", "have xyxy, and confidence or conf", detections, remedy)
         scale = check_score_scale(score, threshold)
         boxes, confidence = check.boxes(detections.xyxy), _first_known(detections, "confidence", "conf")
         classes, data = _first_known(detections, "class_id", "cls"), getattr(detections, "data", None)
@@ -438,9 +436,7 @@ def check_score_scale(score: object, threshold: float | None) -> ScoreScale:
     if isinstance(score, (tuple, list)) and len(score) == 2:
         low = check.number(score[0], "score[0]")
         if threshold is not None:
-            raise InvalidInputError(
-                f"threshold must be omitted with score=(low, high): low is the threshold; got {threshold}"
-            )
+            raise invalid("threshold", "be omitted with score=(low, high): it is low", threshold)
         return low, check.number(score[1], "score[1]", above=low)
     check.choice(score, "score", ("probability", "logit"))
     if threshold is not None and score == "probability":
@@ -478,9 +474,7 @@ class Platt(fields.Checked):
         """Return the score that has this probability, in (0, 1), for use as a threshold."""
         value = check.number(probability, "probability", above=0)
         if value >= 1 or self.a == 0:
-            raise InvalidInputError(
-                f"probability must lie in (0, 1) and a must not be 0; got {value:g} and a={self.a:g}"
-            )
+            raise invalid("probability", f"be in (0, 1), and a not 0 (a={self.a:g})", value)
         return (-logit(value) - self.b) / self.a
 
 

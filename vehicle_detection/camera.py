@@ -191,9 +191,8 @@ class Camera(fields.Checked):
         k1, k2 = (check.number(known.get(name, 0.0), name, low=-1, high=1) for name in ("k1", "k2"))
         radius = float(_fisheye_radius(np.array(half), k1, k2)) if known.get("fisheye") else math.tan(half)
         if radius <= 0:
-            raise InvalidInputError(
-                f"k1 and k2 must keep the radius positive up to {angle / 2:g} degrees; got {k1:g} and {k2:g}"
-            )
+            must = f"keep the radius positive up to {angle / 2:g} degrees"
+            raise InvalidInputError(f"k1 and k2 must {must}; got {k1:g} and {k2:g}")
         focal = max(height, width) / (2 * radius)
         size = height, width
         return cls(focal_px=focal, horizon_px=horizon * height, height_m=height_m, shape=size, **known)
@@ -558,9 +557,8 @@ def _check_names(path: Path, values: dict[str, Any]) -> None:
     known = {"image_size", "fov", "lens", "horizon", *Camera.__dataclass_fields__} - {"shape"}
     if values.keys() - known:
         extra = min(values.keys() - known, key=str)
-        raise InvalidInputError(
-            f"camera file {path} must be an object with the names {', '.join(sorted(known))}; got {extra}"
-        )
+        names = ", ".join(sorted(known))
+        raise InvalidInputError(f"camera file {path} must be an object with the names {names}; got {extra}")
     for pair in (("fov", "lens"), ("fov", "focal_px"), ("lens", "focal_px"), ("horizon", "horizon_px")):
         if values.keys() >= {*pair}:
             raise InvalidInputError(f"camera file {path} must hold {' or '.join(pair)}, not both; drop one")

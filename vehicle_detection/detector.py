@@ -303,10 +303,8 @@ def _check_confidence(conf: object, regions: RegionParams | HeatParams | None) -
     """Return a minimum confidence within the range that a calibration can tell apart."""
     limit = min(max(check.number(conf, "conf", low=0, high=1), _MIN_CONF), _MAX_CONF)
     if isinstance(regions, HeatParams):
-        raise InvalidInputError(
-            f"conf must be None with a heat map, whose heat is no probability; got {conf:g}; set the "
-            "threshold of HeatParams"
-        )
+        remedy = "set the threshold of HeatParams"
+        raise invalid("conf", "be None with a heat map, whose heat is no probability", conf, remedy)
     return limit
 
 

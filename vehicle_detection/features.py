@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import _kernels as kernels
-from vehicle_detection._common import check, describe, fields, progress_bar, resolve_jobs
+from vehicle_detection._common import check, fields, invalid, progress_bar, resolve_jobs
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image
 
@@ -400,10 +400,8 @@ def read_patches(source: Any, name: str) -> NDArray[np.uint8]:
     """Return patches as ``(N, 64, 64, 3)`` uint8; the files of a list of paths are read."""
     source = getattr(source, "patches", source)  # of a PatchSet
     if isinstance(source, (str, os.PathLike)) or not isinstance(source, Iterable):
-        raise InvalidInputError(
-            f"{name} must be patches or a list of paths, got {describe(source)}; "
-            "read a folder or zip with vehicle_detection.load_patches"
-        )
+        remedy = "read a folder or zip with vehicle_detection.load_patches"
+        raise invalid(name, "be patches or a list of paths", source, remedy)
     if not isinstance(source, np.ndarray) or (source.ndim == 1 and source.dtype.kind in "UO"):
         source = [read_image(item) if isinstance(item, (str, os.PathLike)) else item for item in source]
     return check.patches(source, PATCH_SIZE, name)

@@ -133,9 +133,7 @@ def _decode_heif(data: bytes, name: str) -> NDArray[np.uint8]:
         if width * height <= Limit.PIXELS.current():
             return image_array(picture.to_pillow())
     except (OSError, ValueError, RuntimeError, MemoryError) as error:
-        raise InvalidInputError(
-            f"{name} must be a complete HEIC file; it cannot be decoded: {error}"
-        ) from None
+        raise InvalidInputError(f"{name} must be a complete HEIC file; it cannot be read: {error}") from None
     raise InvalidInputError(
         f"{name} must have at most {Limit.PIXELS.current():,} pixels, got {width}x{height}; if the image is "
         f"meant to be so large, set {Limit.PIXELS.variable}"
@@ -236,9 +234,7 @@ def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
     rgb = check.image(image)
     check.path(path)
     if not cv2.haveImageWriter(f"image{Path(path).suffix}"):
-        raise InvalidInputError(
-            f"path must end in .png, .jpg or another image suffix, got {Path(path).name!r}"
-        )
+        raise invalid("path", "end in .png, .jpg or another image suffix", Path(path).name)
     # Not cv2.imwrite: it ends Python if the name is not UTF-8, and does not say why it failed.
     done, data = cv2.imencode(Path(path).suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
     if not done:

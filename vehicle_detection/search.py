@@ -58,9 +58,7 @@ def _pair(*, low: float, high: float) -> Callable[[Any, str], Pair]:
 
 def _check_bands(bands: Any, name: str) -> tuple[SearchBand, ...]:
     if not (isinstance(bands, (tuple, list)) and bands and all(isinstance(b, SearchBand) for b in bands)):
-        raise InvalidInputError(
-            f"{name} must be a tuple of SearchBand, at least one; got {check.describe(bands)}"
-        )
+        raise check.invalid(name, "be a tuple of SearchBand, at least one", bands)
     return tuple(bands)
 
 
@@ -103,9 +101,7 @@ class SearchBand(fields.Checked):
         super().__post_init__()
         for name, (start, stop) in (("x", self.x), ("y", self.y)):
             if start >= stop:
-                raise InvalidInputError(
-                    f"{name} must be (start, stop) with start < stop; got {(start, stop)}"
-                )
+                raise check.invalid(name, "be (start, stop) with start < stop", (start, stop))
 
     def place(
         self, shape: tuple[int, ...], horizon: float, horizontal_padding: float = 0.0

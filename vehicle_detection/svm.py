@@ -202,9 +202,7 @@ class VehicleClassifier:
             raise invalid("params", "be the FeatureParams of the pipeline's features", params)
         # The gains change the weights only, not the features.
         if known and replace(params, hist_gain=known.hist_gain, coarse_gain=known.coarse_gain) != known:
-            raise InvalidInputError(
-                f"params must equal those of the pipeline, {known}, or be omitted; got {params}"
-            )
+            raise invalid("params", f"equal those of the pipeline, {known}, or be omitted", params)
         template = fold_estimators(steps, params.length)
         check_equal_scores(template, steps)
         if len(steps) > 1 and has_unit_range(template.mean, template.scale, params):
@@ -360,9 +358,8 @@ def _weights(classifier: Any, length: int) -> tuple[NDArray[np.float64], float]:
         )
     labels = list(classifier.classes_)
     if labels not in ([0, 1], [-1, 1]):
-        raise InvalidInputError(
-            f"pipeline must be fitted on the labels 0 or -1 for others and 1 for vehicles; got {labels}"
-        )
+        must = "be fitted on the labels 0 or -1 for others and 1 for vehicles"
+        raise invalid("pipeline", must, labels)
     coef = classifier.coef_
     coef = np.asarray(coef.toarray() if hasattr(coef, "toarray") else coef, np.float64).ravel()
     _check_length(len(coef), length, name)

@@ -136,9 +136,8 @@ class TrackTable:
             raise InvalidInputError("score must be finite, got NaN or infinity; drop those rows")
         for (key, track), times in Counter(zip(frames, given["track_id"].tolist())).items():
             if track != NO_TRACK and times > 1:
-                raise InvalidInputError(
-                    f"frame {key!r} holds track {track} twice; give each vehicle its own number"
-                )
+                twice = f"frame {key!r} holds track {track} twice"
+                raise InvalidInputError(f"{twice}; give each vehicle its own number")
         kind = object if frames and isinstance(frames[0], str) else np.int64
         keys = set(check_keys((*check_keys(frame_keys, "frame_keys"), *frames), "frame_keys"))
         self._set({"frame": np.array(frames, kind), "boxes": corners, **given}, sorted(keys, key=frame_order))
@@ -172,9 +171,7 @@ class TrackTable:
             keys = keys if len({*keys}) == len(paths) else map(str, paths)
             return cls.from_detections(dict(zip(keys, detections)))
         if not isinstance(detections, Mapping):
-            raise InvalidInputError(
-                f"detections must be a list or a dictionary, got {check.describe(detections)}"
-            )
+            raise invalid("detections", "be a list or a dictionary", detections)
         for key, found in detections.items():
             check.instance(found, f"detections[{key!r}]", Detections, "pass Detections(boxes, scores)")
         parts = [Detections.empty(), *detections.values()]
@@ -217,11 +214,9 @@ class TrackTable:
         values are 0. A column ``class``, ``label`` or ``category`` selects vehicles as in `read_labels`.
         """
         if not hasattr(table, "iloc") or not hasattr(table, "columns"):
-            remedy = "; convert it with table.to_pandas()" if hasattr(table, "to_pandas") else ""
-            raise InvalidInputError(
-                f"table must be a pandas.DataFrame with the columns frame, {', '.join(CORNERS)}; "
-                f"got {check.describe(table)}{remedy}"
-            )
+            remedy = "convert it with table.to_pandas()" if hasattr(table, "to_pandas") else ""
+            must = f"be a pandas.DataFrame with the columns frame, {', '.join(CORNERS)}"
+            raise invalid("table", must, table, remedy)
         names = list(table.columns)
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
@@ -503,9 +498,8 @@ def _parse_frames(cells: Sequence[Any], places: Sequence[str]) -> list[FrameKey]
         elif isinstance(cell, _REAL) and type(cell) is not bool and 0 <= cell <= _MAX_ID and cell % 1 == 0:
             keys.append(int(cell))
         else:
-            raise DatasetError(
-                f"{place}: frame must be a whole number from 0 or a name, got {check.describe(cell)}"
-            )
+            got = check.describe(cell)
+            raise DatasetError(f"{place}: frame must be a whole number from 0 or a name, got {got}")
         if type(keys[-1]) is not type(keys[0]):
             raise DatasetError(f"{place}: frame must be a number in every row, or a name in every row")
     return keys

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check, describe
+from vehicle_detection._common import check, describe, invalid
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE, extract_features
@@ -117,19 +117,16 @@ def search_windows(
     fractional = (boxes != given).any(1)
     if fractional.any():
         row = int(np.argmax(fractional))
-        raise InvalidInputError(
-            f"windows must be whole pixels; got {given[row].tolist()} in row {row}; round them first"
-        )
+        raise invalid(f"windows[{row}]", "be whole pixels", given[row].tolist(), "round them first")
     min_score = -np.inf if min_score is None else check.number(min_score, "min_score")
     height, width = image.shape[:2]
     inside = (boxes[:, :2] >= 0).all(1) & (boxes[:, 2] <= width) & (boxes[:, 3] <= height)
     valid = inside & (boxes[:, 2:] > boxes[:, :2]).all(1)
     if not valid.all():
         row = int(np.argmin(valid))
-        raise InvalidInputError(
-            f"windows must be non-empty boxes inside the {width}x{height} image; got {boxes[row].tolist()} "
-            f"in row {row}; use slide_window, or clip_boxes and drop empty boxes"
-        )
+        must = f"be non-empty boxes inside the {width}x{height} image"
+        remedy = "use slide_window, or clip_boxes and drop empty boxes"
+        raise invalid(f"windows[{row}]", must, boxes[row].tolist(), remedy)
     patches = np.empty((len(boxes), PATCH_SIZE, PATCH_SIZE, 3), np.uint8)
     for patch, (x1, y1, x2, y2) in zip(patches, boxes):
         cv2.resize(image[y1:y2, x1:x2], (PATCH_SIZE, PATCH_SIZE), dst=patch)

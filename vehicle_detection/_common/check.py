@@ -147,9 +147,7 @@ def patches(values: object, size: int, name: str = "patches") -> NDArray[np.uint
             remedy = f"pass a single patch as {name}[None]"
         elif values.ndim in (3, 4):
             remedy = f"resize each image with cv2.resize(image, ({size}, {size}))"
-    raise invalid(
-        name, f"be an (N, {size}, {size}, 3) uint8 RGB array or a list of such images", values, remedy
-    )
+    raise invalid(name, f"be an (N, {size}, {size}, 3) uint8 RGB array or a list of images", values, remedy)
 
 
 def array(values: object, name: str) -> NDArray[Any]:
@@ -159,10 +157,8 @@ def array(values: object, name: str) -> NDArray[Any]:
     except (ValueError, TypeError, OverflowError, RuntimeError) as error:
         # Errors of tensors state how to convert them, those of NumPy do not help.
         reason = "" if isinstance(error, ValueError) else f"; {error}"
-        raise InvalidInputError(
-            f"{name} must be an array or a sequence of numbers of equal lengths, got {describe(values)}"
-            + reason
-        ) from error
+        must = "be an array or a sequence of numbers of equal lengths"
+        raise InvalidInputError(f"{name} must {must}, got {describe(values)}{reason}") from error
 
 
 def shape(value: object) -> tuple[int, int]:

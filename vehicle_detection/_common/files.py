@@ -55,9 +55,8 @@ def make_folder(path: str | os.PathLike[str], name: str) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InvalidInputError(
-            f"{name} must be a folder, {folder} cannot be created: {error.strerror}; choose another"
-        ) from error
+        reason = f"{folder} cannot be created: {error.strerror}"
+        raise InvalidInputError(f"{name} must be a folder, {reason}; choose another") from error
     return folder
 
 

@@ -7,6 +7,7 @@ import stat
 from enum import Enum
 from pathlib import Path
 
+from vehicle_detection._common.check import invalid
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 
 
@@ -32,9 +33,7 @@ class Limit(Enum):
         if not text:
             return int(self.value[1])
         if not text.isascii() or not text.isdecimal() or len(text) > 16 or not 1 <= int(text) <= 10**15:
-            raise InvalidInputError(
-                f"{self.variable} must be a number of {self.value[2]} from 1 to 1e15; got {text!r}"
-            )
+            raise invalid(self.variable, f"be a number of {self.value[2]} from 1 to 1e15", text)
         return int(text)
 
     def exceeded(self, name: str) -> str:

@@ -53,9 +53,8 @@ def write_model(
     try:
         metadata_json = json.dumps(dict(metadata), sort_keys=True)
     except (TypeError, ValueError) as error:
-        raise InvalidInputError(
-            f"metadata must contain JSON values only: {error}; convert NumPy numbers with .item()"
-        ) from error
+        remedy = "convert NumPy numbers with .item()"
+        raise InvalidInputError(f"metadata must contain JSON values only: {error}; {remedy}") from error
     header = {"format": FORMAT, "format_version": FORMAT_VERSION, "kind": kind}
     header |= {"params": json.dumps(dict(params), sort_keys=True), "metadata": metadata_json}
     header["sha256"] = checksum(header, tensors)
@@ -94,9 +93,7 @@ def read_model(path: str | os.PathLike[str], kind: str) -> ModelData:
     file = check.path(path)
     name = f"model file {file}"
     if not os.path.lexists(file):
-        raise ModelFileError(
-            f"{name} does not exist; check the path, or name a shipped model: {', '.join(SHIPPED)}"
-        )
+        raise ModelFileError(f"{name} does not exist; check the path, or pass {' or '.join(SHIPPED)}")
     return _parse(read_regular_file(file, name, Limit.MODEL_BYTES, error=ModelFileError), name, kind)
 
 
@@ -127,9 +124,8 @@ def _parse(data: bytes, name: str, kind: str) -> ModelData:
                 f"{name} looks like a pickle, which is not opened because it may run any code; load it "
                 "yourself, and pass its classifier and scaler to VehicleClassifier.from_pipeline"
             ) from error
-        raise ModelFileError(
-            f"{name} is not a complete safetensors file ({error}); download it again or train a model"
-        ) from error
+        reason = f"is not a complete safetensors file ({error})"
+        raise ModelFileError(f"{name} {reason}; download it again or train a model") from error
     if header.get("format") != FORMAT:
         raise ModelFileError(f"{name} is a safetensors file, but not a model of this library; train one")
     if header.get("format_version") != FORMAT_VERSION:

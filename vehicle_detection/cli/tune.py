@@ -113,9 +113,8 @@ def _compare_searches(
         try:
             lists["scales"] = [tuple(map(float, str(each).split("+"))) for each in lists["scales"]]
         except ValueError:
-            raise InvalidInputError(
-                f"--grid must join scales by +, as in 'scales=1,0.8+1+1.5'; got {lists['scales']}"
-            ) from None
+            must = "join scales by +, as in 'scales=1,0.8+1+1.5'"
+            raise common.invalid("--grid", must, lists["scales"]) from None
     table = vd.training.compare_searches(vd.load_classifier(model), frames, **lists)
     table["scales"] = ["+".join(f"{side:g}" for side in sides) for sides in table["scales"]]
     rows = [

@@ -362,9 +362,8 @@ def read_speed(own_speed: str | None, gpx: Path | None, offset: float) -> vd.dri
         return None
     found = re.fullmatch(r"(\d{1,3}(?:\.\d*)?) ?(km/h|kmh|mph)?", own_speed.strip().lower())
     if found is None or float(found[1]) > _MAX_OWN_SPEED:
-        raise common.invalid(
-            "--own-speed", f"be a speed of at most {_MAX_OWN_SPEED:g}, such as 100 (km/h) or 62mph", own_speed
-        )
+        must = f"be a speed of at most {_MAX_OWN_SPEED:g}, such as 100 (km/h) or 62mph"
+        raise common.invalid("--own-speed", must, own_speed)
     unit = common.UNITS["imperial" if found[2] == "mph" else "metric"].speed
     return vd.drive.OwnSpeed.constant(float(found[1]) / unit)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection import _kernels as kernels
 from vehicle_detection import features as library
-from vehicle_detection._common import check, describe, fields, is_listing
+from vehicle_detection._common import check, describe, fields, invalid, is_listing
 from vehicle_detection.course.versions import (
     CHANNEL_ORDERS,
     READERS,
@@ -52,19 +52,15 @@ def check_lesson_image(img: Any, name: str = "img", *, drop_alpha: bool = False)
     """Return an ``(H, W, 3)`` image as uint8 or float32; `drop_alpha` accepts a fourth channel."""
     if isinstance(img, np.ndarray) and img.ndim == 3 and img.shape[2] == 4:
         if not drop_alpha:
-            raise InvalidInputError(
-                f"{name} must be an (H, W, 3) RGB array, got {describe(img)}; drop the alpha channel with "
-                f"{name}[..., :3]"
-            )
+            remedy = f"drop the alpha channel with {name}[..., :3]"
+            raise invalid(name, "be an (H, W, 3) RGB array", img, remedy)
         img = np.ascontiguousarray(img[..., :3])
     if not isinstance(img, np.ndarray) or img.ndim != 3 or img.shape[2] != 3 or not img.size:
         raise InvalidInputError(f"{name} must be an (H, W, 3) RGB array; got {describe(img)}")
     if img.dtype in (np.uint8, np.float32):
         return img
     if img.dtype.kind != "f":
-        raise InvalidInputError(
-            f"{name} must be uint8 or float, got {img.dtype}; convert it with {name}.astype(numpy.uint8)"
-        )
+        raise invalid(name, "be uint8 or float", img, f"convert it with {name}.astype(numpy.uint8)")
     return img.astype(np.float32)
 
 
@@ -153,9 +149,7 @@ def get_hog_features(
     ((7, 7, 2, 2, 9), (64, 64))
     """
     if not isinstance(img, np.ndarray) or img.ndim != 2 or img.dtype.kind not in "uif":
-        raise InvalidInputError(
-            f"img must be one (H, W) channel of numbers, got {describe(img)}; pick one with image[..., 0]"
-        )
+        raise invalid("img", "be one (H, W) channel of numbers", img, "pick one with image[..., 0]")
     check.flags(vis=vis, visualise=visualise, visualize=visualize, feature_vec=feature_vec)
     transform_sqrt = check_switch(transform_sqrt, "transform_sqrt")
     sizes = {"orient": orient, "pix_per_cell": pix_per_cell, "cell_per_block": cell_per_block}
@@ -278,9 +272,7 @@ def hog_blocks(
     height, width, _ = image.shape
     side = cell * block
     if min(height, width) < side:
-        raise InvalidInputError(
-            f"img must be at least one block large ({side}x{side} pixels); got {width}x{height}"
-        )
+        raise invalid("img", f"be at least one block large ({side}x{side} pixels)", image)
     blocks = kernels.hog_blocks(kernels.hog_cells(image, orient, cell, transform_sqrt), block)
     rows, columns = height // cell - block + 1, width // cell - block + 1
     return blocks[..., :rows, :columns].transpose(0, 4, 5, 1, 2, 3)
@@ -393,9 +385,7 @@ def extract_features(
     if not is_listing(imgs):
         raise InvalidInputError(f"imgs must be a list of file names or images; got {describe(imgs)}")
     if isinstance(imgs, np.ndarray) and imgs.ndim in (2, 3) and imgs.dtype.kind in "uif":
-        raise InvalidInputError(
-            f"imgs must be a list of images, got {describe(imgs)}; pass [image], or use single_img_features"
-        )
+        raise invalid("imgs", "be a list of images", imgs, "pass [image], or use single_img_features")
     if isinstance(imgs, np.ndarray) and are_uint8_patches(imgs):
         return options.compute(imgs)
     items: list[Any] = list(imgs)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import heatmap as library
-from vehicle_detection._common import check, describe
+from vehicle_detection._common import check, describe, invalid
 from vehicle_detection.course.features import Image, check_lesson_image
 from vehicle_detection.course.versions import FORMULAS, lesson_function
 from vehicle_detection.errors import InvalidInputError
@@ -90,9 +90,7 @@ def _window_starts(start: int, stop: int, side: int, overlap: float, formula: st
     """First pixels of the windows along one axis."""
     step = int(side * (1 - check.number(overlap, "xy_overlap", low=0)))
     if step < 1:
-        raise InvalidInputError(
-            f"xy_overlap must leave a step of 1 pixel or more between windows of {side} pixels; got {overlap}"
-        )
+        raise invalid("xy_overlap", f"leave a step of 1 pixel or more between {side} pixels", overlap)
     if formula == "old":
         count = int((stop - start) / step) - 1
     else:
@@ -114,10 +112,8 @@ def corner_array(boxes: Any, name: str) -> NDArray[np.int64]:
     items = rows if isinstance(rows, list) or (isinstance(rows, np.ndarray) and rows.ndim) else ()
     # An RGB image, or a list with images or rows of one, as by boxes.extend(image).
     if any(isinstance(item, np.ndarray) and item.ndim >= 2 and item.shape[-1] == 3 for item in items):
-        raise InvalidInputError(
-            f"{name} must be a list of corner pairs ((x1, y1), (x2, y2)), got an image or rows of one; "
-            "find_cars returns a picture, find_car_windows returns the boxes"
-        )
+        got = "got an image or rows of one; find_cars returns a picture, find_car_windows returns the boxes"
+        raise InvalidInputError(f"{name} must be a list of corner pairs ((x1, y1), (x2, y2)), {got}")
     try:
         array = np.asarray(rows)
     except ValueError:  # rows of different lengths, such as boxes with scores
@@ -128,9 +124,7 @@ def corner_array(boxes: Any, name: str) -> NDArray[np.int64]:
     if array.size == 0:
         return np.empty((0, 4), np.int64)
     if array.shape[1:] not in ((4,), (2, 2)) or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
-        raise InvalidInputError(
-            f"{name} must be a list of corner pairs ((x1, y1), (x2, y2)); got {describe(boxes)}"
-        )
+        raise invalid(name, "be a list of corner pairs ((x1, y1), (x2, y2))", boxes)
     return np.asarray(np.rint(array).astype(np.int64).reshape(-1, 4))
 
 
@@ -221,10 +215,8 @@ def labeled_bboxes(labels: Any, shape: tuple[int, ...] | None = None) -> list[Co
     array, count = labels if isinstance(labels, (tuple, list)) and len(labels) == 2 else (None, 0)
     array = array if isinstance(array, np.ndarray) else np.array(None)
     if array.ndim != 2 or array.dtype.kind not in "iu" or shape not in (None, array.shape):
-        raise InvalidInputError(
-            f"labels must be the pair that scipy.ndimage.label returns for a map of {shape or '(H, W)'}; "
-            f"got {describe(labels)}"
-        )
+        must = f"be the pair that scipy.ndimage.label returns for a map of {shape or '(H, W)'}"
+        raise invalid("labels", must, labels)
     regions = find_objects(array, max_label=check.integer(count, "the number of labels", low=0))
     return [((x.start, y.start), (x.stop - 1, y.stop - 1)) for y, x in filter(None, regions)]
 

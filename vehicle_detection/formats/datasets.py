@@ -105,9 +105,7 @@ def _read_file(source: Path, truth: Path | None = None) -> CocoFile:
         images = {image["id"]: _frame_of(image) for image in data["images"]}
         names = {entry["id"]: " ".join(str(entry["name"]).lower().split()) for entry in data["categories"]}
     except (KeyError, TypeError, AttributeError):
-        raise DatasetError(
-            f"{source}: every image and category needs an id, and every category a name"
-        ) from None
+        raise DatasetError(f"{source}: images and categories need an id, and categories a name") from None
     if {*map(type, images.values())} not in (set(), {int}, {str}):
         raise DatasetError(f"{source}: give every image a file_name, or none of them and integer ids")
     if len(set(images.values())) < len(data["images"]):
@@ -381,10 +379,8 @@ def _yolo_record(where: str, words: list[str], shape: tuple[int, ...]) -> tuple[
     if len(words) > 5:
         confidence = parse_number(words[5], "confidence", where)
         if not 0 <= confidence <= 1:
-            raise DatasetError(
-                f"{where}: confidence must be from 0 to 1, got {describe(words[5])}; it may be one of "
-                f"{_TRACKS_ALONE}"
-            )
+            got = f"got {describe(words[5])}; it may be one of {_TRACKS_ALONE}"
+            raise DatasetError(f"{where}: confidence must be from 0 to 1, {got}")
         record["score"] = logit(min(max(confidence, _MIN_CONFIDENCE), 1 - _MIN_CONFIDENCE))
         record["track_id"] = parse_number(words[6], "track", where) if len(words) > 6 else None
     if not FRAME_NUMBER.fullmatch(words[0]):

@@ -216,9 +216,7 @@ def _mot_rows(
             raise DatasetError(f"{where}: expected frame, id, x, y, width, height, found {len(words)} values")
         frame = parse_number(words[0], "frame (counted from 1)", where)
         if frame < 1 or frame != int(frame):
-            raise DatasetError(
-                f"{where}: frame (counted from 1) must be at least 1, got {describe(words[0])}"
-            )
+            raise DatasetError(f"{where}: frame (counted from 1) must be at least 1, got {words[0]!r}")
         x, y, width, height = (parse_number(word, "side of the box", where) for word in words[2:6])
         track, *values = (parse_number(word, "value", where) for word in (words[1], *words[6:]))
         x, y = x - first_pixel, y - first_pixel
@@ -260,10 +258,8 @@ def _read_mot_zip(source: Path, classes: Collection[str] | None) -> FileRows:
         if labels and number is not None:
             index = parse_number(number, "class", where)
             if index not in range(1, len(labels) + 1):
-                raise DatasetError(
-                    f"{where}: class must be a whole number from 1 to {len(labels)}, as in gt/labels.txt, "
-                    f"got {number}"
-                )
+                expected = f"a whole number from 1 to {len(labels)}, as in gt/labels.txt"
+                raise DatasetError(f"{where}: class must be {expected}, got {number}")
             record["label"] = labels[int(index) - 1]
             if record["label"] not in wanted:
                 continue
@@ -379,9 +375,7 @@ def read_labels(
         raise DatasetError(f"{source} does not exist; check the path")
     kind = format or _guess_format(source)
     if source.is_dir() and kind not in FOLDER_FORMATS:
-        raise DatasetError(
-            f"{source} is a folder, and {kind} labels are one file; pass the path of that file"
-        )
+        raise DatasetError(f"{source} is a folder, and {kind} labels are one file; pass its path")
     chosen = None
     if classes is not None:
         chosen = frozenset(str(name).lower() for name in check.sequence(classes, "classes", "names"))
@@ -410,17 +404,15 @@ def _table_of(
     sides = boxes[:, 2:] - boxes[:, :2]
     wrong = np.flatnonzero(((sides < 0) | (labelled & (sides == 0))).any(axis=1))
     if wrong.size:
-        raise DatasetError(
-            f"{places[wrong[0]]}: a box needs x1 < x2 and y1 < y2, got {boxes[wrong[0]].tolist()}"
-        )
+        place, box = places[wrong[0]], boxes[wrong[0]].tolist()
+        raise DatasetError(f"{place}: a box needs x1 < x2 and y1 < y2, got {box}")
     first: dict[tuple[FrameKey, int], str] = {}
     if "track_id" in columns:
         for frame, track, place in zip(columns["frame"], columns["track_id"].tolist(), places, strict=True):
             before = place if track == NO_TRACK else first.setdefault((frame, track), place)
             if before != place:
-                raise DatasetError(
-                    f"{place}: track {track} comes twice in frame {describe(frame)}, first at {before}"
-                )
+                twice = f"track {track} comes twice in frame {describe(frame)}"
+                raise DatasetError(f"{place}: {twice}, first at {before}")
     if shape is not None:
         columns["boxes"] = clip_boxes(boxes, shape)
         gone = np.flatnonzero((columns["boxes"][:, :2] == columns["boxes"][:, 2:]).any(axis=1))
@@ -440,9 +432,8 @@ def _guess_format(source: Path) -> str:
             return "yolo"
         for suffix, tool in ((".xml", "Pascal VOC"), (".json", "a tool with a file for each image")):
             if any(source.glob(f"*{suffix}")) and not any(source.glob("*.txt")):
-                raise DatasetError(
-                    f"{source} holds {suffix} files, as of {tool}, which are not read; export one COCO file"
-                )
+                reason = f"holds {suffix} files, as of {tool}, which are not read"
+                raise DatasetError(f"{source} {reason}; export one COCO file")
         lines = (line for file in source.glob("*.txt") for _, line in read_lines(file))
         words = next(lines, "").split()
         outlines = len(words) > 8 and not any(word.isalpha() for word in words)  # of YOLO

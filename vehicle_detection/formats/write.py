@@ -259,9 +259,8 @@ def _new_folder(path: Path, kind: str) -> Iterator[Path]:
     if path.is_file() or (path.is_dir() and any(path.iterdir())):
         raise InvalidInputError(f"path must be a new or empty folder for {kind}, got {path}; choose another")
     if not path.parent.is_dir():
-        raise InvalidInputError(
-            f"path needs an existing folder, {describe(str(path.parent))} is not one; create it first"
-        )
+        missing = describe(str(path.parent))
+        raise InvalidInputError(f"path needs an existing folder, {missing} is not one; create it first")
     with temporary_folder(path.parent, path.name[:32]) as temporary:
         part = temporary / "new"
         part.mkdir()

@@ -264,7 +264,5 @@ def shown_tracks(tracks: Iterable[Any]) -> list[Any]:
             shown.append(track)
     repeated = next((track for track, times in Counter(each.id for each in shown).items() if times > 1), None)
     if repeated is not None:
-        raise InvalidInputError(
-            f"tracks must have unique ids, got {repeated} twice in one frame; pass result.tracks"
-        )
+        raise invalid("tracks", "have unique ids", repeated, "it comes twice; pass result.tracks")
     return shown
