@@ -30,11 +30,11 @@ class BatchOptions:
     """Options of ``batch``."""
 
     output: str = option(
-        ...,
         "DIR|URL",
         "Folder or URL of the results, such as results or s3://fleet/results.",
         "-o",
         "--output",
+        default=...,
     )
     sources: list[str] | None = Argument(
         None,
@@ -45,12 +45,12 @@ class BatchOptions:
     classes: str | None = shared.CLASSES
     device: str = shared.DEVICE
     conf: float | None = shared.CONFIDENCE
-    jobs: int | None = option(None, "N", "Worker processes of one thread, such as 4; default: one per core.")
-    shard: str | None = option(None, "I/N", "Process the I-th of N parts, such as 2/8, for job arrays.")
+    jobs: int | None = option("N", "Worker processes of one thread, such as 4; default: one per core.")
+    shard: str | None = option("I/N", "Process the I-th of N parts, such as 2/8, for job arrays.")
     dask: str | None = option(
-        None, "ADDRESS|local", "Use a Dask cluster, such as tcp://10.0.0.5:8786, or start one here."
+        "ADDRESS|local", "Use a Dask cluster, such as tcp://10.0.0.5:8786, or start one here."
     )
-    group: str = option("trip", "trip|file", "Make consecutive segments one trip, or each file.")
+    group: str = option("trip|file", "Make consecutive segments one trip, or each file.", default="trip")
     tracks_only: bool = flag("--tracks-only", "Write no videos.")
     horizon: float | None = shared.HORIZON
     camera: str | None = shared.CAMERA
@@ -63,7 +63,7 @@ class BatchOptions:
     retry_failed: bool = flag("--retry-failed", "Process trips again whose source could not be processed.")
     dry_run: bool = flag("--dry-run", "Only list the trips that would be processed.")
     status: bool = flag("--status", "Only show what has been done.")
-    summary: Path | None = option(None, "FILE.csv", "Table with a row for each trip that has been done.")
+    summary: Path | None = option("FILE.csv", "Table with a row for each trip that has been done.")
     quiet: bool = flag("-q", "Print errors only.", "--quiet")
 
 

@@ -27,9 +27,9 @@ SHEET, _TILE = (2, 3), (640, 360)
 
 @option_names(random_state="--seed")
 def demo(
-    output: Path = option(Path("demo"), "DIR", "Folder to write.", "-o", "--output"),
-    frames: int = option(120, "N", "Number of frames."),
-    seed: int = option(0, "N", "Random seed of the scene."),
+    output: Path = option("DIR", "Folder to write.", "-o", "--output", default=Path("demo")),
+    frames: int = option("N", "Number of frames.", default=120),
+    seed: int = option("N", "Random seed of the scene.", default=0),
     report: bool = flag("--report", "Write a page with the video and its tracks."),
 ) -> None:
     """Draw a drive, annotate it with the default model and score it against the ground truth.

@@ -51,28 +51,24 @@ class DetectOptions:
         ..., metavar="IMAGE...", help="Image files, such as frames/*.jpg; folders; URLs."
     )
     output: Path | None = shared.output(
-        None, "DIR", "Folder for annotated images, such as found.", "-o", "--output"
+        "DIR", "Folder for annotated images, such as found.", "-o", "--output"
     )
-    boxes: Path | None = shared.output(
-        None, "FILE", "Boxes by file name: .csv, .jsonl, .parquet or .json (COCO)."
-    )
+    boxes: Path | None = shared.output("FILE", "Boxes by file name: .csv, .jsonl, .parquet or .json (COCO).")
     why: Path | None = shared.output(
-        None, "DIR", "Folder, such as why, for pictures that explain each box: the share of each cell."
+        "DIR", "Folder, such as why, for pictures that explain each box: the share of each cell."
     )
     model: str = shared.MODEL
     classes: str | None = shared.CLASSES
     device: str = shared.DEVICE
-    jobs: int | None = shared.search(
-        None, "N", "Images searched in parallel, such as 2; default: one per core."
-    )
+    jobs: int | None = shared.search("N", "Images searched in parallel, such as 2; default: one per core.")
     conf: float | None = shared.CONFIDENCE
     camera: str | None = shared.CAMERA
     fov: float | None = shared.camera(
-        None, "DEG", "Field of view along the longer side in degrees, such as 90, to state distances."
+        "DEG", "Field of view along the longer side in degrees, such as 90, to state distances."
     )
     camera_height: float | None = shared.CAMERA_HEIGHT
     horizon: float | None = shared.HORIZON
-    labels: str = shared.drawing("score", "score|none", "Labels of the boxes in annotated images.")
+    labels: str = shared.drawing("score|none", "Labels of the boxes in annotated images.", default="score")
     line_width: int | None = shared.LINE_WIDTH
     blur: str | None = shared.BLUR
 

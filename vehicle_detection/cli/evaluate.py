@@ -28,20 +28,19 @@ def evaluate(
     labels: Path = Argument(
         ..., metavar="LABELS.csv", help="True boxes, in one of these formats, or a folder of KITTI or YOLO."
     ),
-    iou: float = option(0.5, "F", "Minimum IoU of a correct box."),
+    iou: float = option("F", "Minimum IoU of a correct box.", default=0.5),
     ignored_as_regions: bool = flag(
         "--ignored-as-regions", "Ignore boxes of which half lies in an ignored box."
     ),
     frames: str | None = option(
-        None,
         "LIST|FILE",
         "Score only these frames: numbers, such as 0,6,12, 0-299 or 0-299:6 (every 6th), or a text file "
         "with the number or name of a frame in each line.",
     ),
     images: Path | None = option(
-        None, "DIR", "Folder of the images, whose sizes YOLO folders need, such as images/val."
+        "DIR", "Folder of the images, whose sizes YOLO folders need, such as images/val."
     ),
-    json: Path | None = option(None, "FILE", "File for all scores, such as scores.json."),
+    json: Path | None = option("FILE", "File for all scores, such as scores.json."),
 ) -> None:
     """Score boxes, and tracks if there are any, against labels."""
     from json import dumps

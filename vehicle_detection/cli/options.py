@@ -21,14 +21,14 @@ PATCHES = "--vehicles and --non-vehicles"
 HORIZON_HELP = "Row of the horizon as a fraction of the frame's height, 0 at the top, such as 0.55."
 
 
-def option(default: Any, metavar: str, help: str, *names: str, panel: str | None = None) -> Any:  # noqa: A002 - as typer
+def option(metavar: str, help: str, *names: str, default: Any = None, panel: str | None = None) -> Any:  # noqa: A002 - as typer
     """Option with a value, required if `default` is `...`; without `names`, the parameter names it."""
     return Option(default, *names, metavar=metavar, help=help, rich_help_panel=panel)
 
 
 def flag(name: str, help: str, *names: str, panel: str | None = None) -> Any:  # noqa: A002 - as typer
     """Option without a value; the help shows no type for it."""
-    return option(False, "", help, name, *names, panel=panel)
+    return option("", help, name, *names, default=False, panel=panel)
 
 
 def takes(options: type[Options]) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
@@ -62,42 +62,35 @@ drawing, drawing_flag = (functools.partial(each, panel="Drawing") for each in (o
 output, output_flag = (functools.partial(each, panel="Output") for each in (option, flag))
 
 MODEL = search(
-    "default",
     "NAME|FILE",
     '"default" (any road), "highway" (the course\'s), or a model file, such as yolo11n.onnx.',
+    default="default",
 )
 CLASSES = search(
-    None, "LIST", "Classes of another library's network that are vehicles, such as car,bus,truck or 2,5,7."
+    "LIST", "Classes of another library's network that are vehicles, such as car,bus,truck or 2,5,7."
 )
-DEVICE = search("cpu", "cpu|cuda", "Where a network runs; cuda needs the package onnxruntime-gpu.")
+DEVICE = search("cpu|cuda", "Where a network runs; cuda needs the package onnxruntime-gpu.", default="cpu")
 CONFIDENCE = search(
-    None, "P", "Minimum confidence, a probability from 0 to 1, such as 0.5; default: the model's threshold."
+    "P", "Minimum confidence, a probability from 0 to 1, such as 0.5; default: the model's threshold."
 )
-EVERY = search(
-    None, "N", "Search every N-th frame, and interpolate between; 1: every frame; default: 12 a second."
-)
-HORIZON = camera(None, "F", HORIZON_HELP)
+EVERY = search("N", "Search every N-th frame, and interpolate between; 1: every frame; default: 12 a second.")
+HORIZON = camera("F", HORIZON_HELP)
 CAMERA = camera(
-    None,
     "NAME|FILE",
     "Lens: standard-58, wide-90, fisheye-120, fisheye-140 or fisheye-170; or a file (JSON; OpenCV, ROS).",
 )
 FIELD_OF_VIEW = camera(
-    None, "DEG", "Field of view along the longer side in degrees, such as 90; default: 58, with a warning."
+    "DEG", "Field of view along the longer side in degrees, such as 90; default: 58, with a warning."
 )
-CAMERA_HEIGHT = camera(None, "M", "Height of the lens above the road in meters, such as 1.5; default: 1.3.")
-LINE_WIDTH = drawing(
-    None, "N", "Width of the boxes' lines in pixels, such as 3; default: by size of the frame."
-)
-BLUR = drawing(
-    None, "vehicles|plates", "Blur the vehicles, or the region of their plates, in what is written."
-)
+CAMERA_HEIGHT = camera("M", "Height of the lens above the road in meters, such as 1.5; default: 1.3.")
+LINE_WIDTH = drawing("N", "Width of the boxes' lines in pixels, such as 3; default: by size of the frame.")
+BLUR = drawing("vehicles|plates", "Blur the vehicles, or the region of their plates, in what is written.")
 PRESET = output(
-    "veryfast", "NAME", "Speed of the encoder, from ultrafast (large files) to placebo (small ones)."
+    "NAME", "Speed of the encoder, from ultrafast (large files) to placebo (small ones).", default="veryfast"
 )
 NO_AUDIO = output_flag("--no-audio", "Write no sound.")
-VEHICLES = option(..., "PATH", "Folder or zip of patches of vehicles, such as vehicles.zip.")
-NON_VEHICLES = option(..., "PATH", "Folder or zip of other patches, such as non-vehicles.zip.")
+VEHICLES = option("PATH", "Folder or zip of patches of vehicles, such as vehicles.zip.", default=...)
+NON_VEHICLES = option("PATH", "Folder or zip of other patches, such as non-vehicles.zip.", default=...)
 
 
 def parse_time(text: str | None, name: str) -> float | None:

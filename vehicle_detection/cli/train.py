@@ -25,9 +25,7 @@ from vehicle_detection.cli.output import (
 
 
 def fetch(
-    output: Path | None = option(
-        None, "DIR", "Folder, such as data; default: the user's cache.", "-o", "--output"
-    ),
+    output: Path | None = option("DIR", "Folder, such as data; default: the user's cache.", "-o", "--output"),
 ) -> None:
     """Download the course's training patches (110 MB) once."""
     with output_folder(output, "--output"):
@@ -40,21 +38,27 @@ def fetch(
 def train(
     vehicles: Path = VEHICLES,
     non_vehicles: Path = NON_VEHICLES,
-    output: Path = option(..., "FILE", "Model file to write, such as own.safetensors.", "-o", "--output"),
-    features: str = option("lab-9432", "PRESET", "lab-9432, lab-8460, ycrcb-8460, ycrcb-6156 or luv-2384."),
-    split: str = option("random", "random|sequences", "Split whose accuracy is reported as the model's."),
-    C: float = option(1e-4, "F", "Inverse regularization strength.", "--C"),
-    seed: int = option(0, "N", "Random seed of solver and first split."),
+    output: Path = option(
+        "FILE", "Model file to write, such as own.safetensors.", "-o", "--output", default=...
+    ),
+    features: str = option(
+        "PRESET", "lab-9432, lab-8460, ycrcb-8460, ycrcb-6156 or luv-2384.", default="lab-9432"
+    ),
+    split: str = option(
+        "random|sequences", "Split whose accuracy is reported as the model's.", default="random"
+    ),
+    C: float = option("F", "Inverse regularization strength.", "--C", default=1e-4),
+    seed: int = option("N", "Random seed of solver and first split.", default=0),
     no_mirror: bool = flag("--no-mirror", "Train without mirrored copies."),
     gamma: float | None = option(
-        None, "F", "Brightness range of mirrored copies, such as 0.3; default: 0.4, without mirroring 0."
+        "F", "Brightness range of mirrored copies, such as 0.3; default: 0.4, without mirroring 0."
     ),
-    degraded: float = option(0.05, "W", "Weight of blurred, pale and compressed copies of each patch, 0-1."),
-    report: Path | None = option(None, "FILE.json", "Scores on every split, timings."),
-    card: Path | None = option(None, "FILE.md", "Model card to write."),
-    compare: list[str] | None = option(
-        None, "PRESET", "Other features to evaluate, such as luv-2384; repeatable."
+    degraded: float = option(
+        "W", "Weight of blurred, pale and compressed copies of each patch, 0-1.", default=0.05
     ),
+    report: Path | None = option("FILE.json", "Scores on every split, timings."),
+    card: Path | None = option("FILE.md", "Model card to write."),
+    compare: list[str] | None = option("PRESET", "Other features to evaluate, such as luv-2384; repeatable."),
 ) -> None:
     """Train a model on patches, and evaluate it on held-out patches; by default like the model "highway"."""
     check_distinct_paths({"--non-vehicles": non_vehicles}, {"--vehicles": vehicles})

@@ -18,17 +18,17 @@ def train_frames(
     data: Path = Argument(
         ..., metavar="DATA", help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4."
     ),
-    output: Path = option(..., "FILE", "Model file to write, such as own.onnx.", "-o", "--output"),
+    output: Path = option("FILE", "Model file to write, such as own.onnx.", "-o", "--output", default=...),
     model: str = option(
-        "default", "MODEL", '"default" or a file of this command to continue from, such as own.onnx.'
+        "MODEL", '"default" or a file of this command to continue from, such as own.onnx.', default="default"
     ),
     steps: int | None = option(
-        None, "N", "Steps of 8 samples, 0.6 s each on two cores; default: 5 per frame, 200 to 1200."
+        "N", "Steps of 8 samples, 0.6 s each on two cores; default: 5 per frame, 200 to 1200."
     ),
-    device: str | None = option(None, "cpu|cuda", "Default: cuda where PyTorch offers it."),
-    curves: Path | None = option(None, "FILE.csv", "Precision and recall on each set of held-out frames."),
-    jobs: int | None = option(None, "N", "Threads, such as 2; default: all cores."),
-    seed: int = option(0, "N", "Random seed."),
+    device: str | None = option("cpu|cuda", "Default: cuda where PyTorch offers it."),
+    curves: Path | None = option("FILE.csv", "Precision and recall on each set of held-out frames."),
+    jobs: int | None = option("N", "Threads, such as 2; default: all cores."),
+    seed: int = option("N", "Random seed.", default=0),
 ) -> None:
     """Continue the training of the default model on labelled frames, and evaluate it on a fifth of them.
 

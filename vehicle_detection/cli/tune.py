@@ -38,31 +38,31 @@ _MAX_ROWS = 15
 )
 def tune(
     grid: str = option(
-        ...,
         "GRID",
         "Values to try: 'orient=8,9 color_space=YCrCb,LAB C=1e-4,1', or of the search of a trained model: "
         "'scales=1,0.8+1+1.5 overlap=0.5,0.75 threshold=1,4'.",
+        default=...,
     ),
     output: Path = option(
-        ...,
         "FILE.csv",
         "Table to write: .csv, .jsonl or .parquet. Trained models are saved one by one in a .jsonl file; the "
         "same command resumes an interrupted run.",
         "-o",
         "--output",
+        default=...,
     ),
-    vehicles: Path | None = option(None, "PATH", "Patches of vehicles to train on, such as vehicles.zip."),
-    non_vehicles: Path | None = option(None, "PATH", "Other patches, such as non-vehicles.zip."),
-    model: str | None = option(None, "FILE", "Model of the search, such as a.safetensors; default: highway."),
-    plot: Path | None = option(None, "FILE.png", "Accuracy against search time."),
-    split: str = option("sequences", "sequences|groups|random", "Held-out patches."),
+    vehicles: Path | None = option("PATH", "Patches of vehicles to train on, such as vehicles.zip."),
+    non_vehicles: Path | None = option("PATH", "Other patches, such as non-vehicles.zip."),
+    model: str | None = option("FILE", "Model of the search, such as a.safetensors; default: highway."),
+    plot: Path | None = option("FILE.png", "Accuracy against search time."),
+    split: str = option("sequences|groups|random", "Held-out patches.", default="sequences"),
     halving: bool = flag("--halving", "Eliminate poor configurations on few patches (successive halving)."),
-    finalists: int = option(3, "N", "Configurations to measure fully after --halving."),
-    frames: Path | None = option(None, "DIR", "Labelled frames to score models on, such as test_images."),
-    labels: Path | None = option(None, "FILE.csv", "True boxes of --frames."),
-    horizon: float | None = option(None, "F", "Horizon of --frames, 0 (top) to 1, such as 0.55."),
-    seed: int = option(0, "N", "Random seed of splits and training."),
-    cache: Path | None = option(None, "DIR", "Folder to keep features in, such as cache."),
+    finalists: int = option("N", "Configurations to measure fully after --halving.", default=3),
+    frames: Path | None = option("DIR", "Labelled frames to score models on, such as test_images."),
+    labels: Path | None = option("FILE.csv", "True boxes of --frames."),
+    horizon: float | None = option("F", "Horizon of --frames, 0 (top) to 1, such as 0.55."),
+    seed: int = option("N", "Random seed of splits and training.", default=0),
+    cache: Path | None = option("DIR", "Folder to keep features in, such as cache."),
 ) -> None:
     """Measure every combination of a grid of parameters, of training or of the search, and show the best."""
     common.check.integer(finalists, "--finalists", low=1)

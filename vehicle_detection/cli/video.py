@@ -51,7 +51,6 @@ class VideoOptions:
         "URL; camera, such as 0; or -.",
     )
     output: Path | None = shared.output(
-        None,
         "TARGET",
         "Video to write: .mp4, .m4v, .mov or .mkv; default: beside the source, such as drive_tracked.mp4.",
         "-o",
@@ -59,53 +58,52 @@ class VideoOptions:
     )
     show: bool = shared.output_flag("--show", "Show the annotated frames in a window; Escape ends the run.")
     tracks: Path | None = shared.output(
-        None, "FILE", "Tracks: .csv, .jsonl, .parquet, .txt (MOT), .zip (CVAT) or .json (COCO)."
+        "FILE", "Tracks: .csv, .jsonl, .parquet, .txt (MOT), .zip (CVAT) or .json (COCO)."
     )
-    report: Path | None = shared.output(None, "FILE.html", "Page with the video and its tracks.")
+    report: Path | None = shared.output("FILE.html", "Page with the video and its tracks.")
     why: bool = shared.output_flag(
         "--why", "Explain a box of each vehicle in --report: the share of each cell."
     )
-    events: Path | None = shared.output(
-        None, "FILE", "Events, such as cut-ins and overtaking: .csv or .json."
-    )
+    events: Path | None = shared.output("FILE", "Events, such as cut-ins and overtaking: .csv or .json.")
     clips: Path | None = shared.output(
-        None, "DIR", "Folder for a short annotated clip of each event, such as clips."
+        "DIR", "Folder for a short annotated clip of each event, such as clips."
     )
     clips_of: str | None = shared.output(
-        None, "KINDS", "Kinds of events for --clips, such as cut_in,closing; default: all."
+        "KINDS", "Kinds of events for --clips, such as cut_in,closing; default: all."
     )
     srt: Path | None = shared.output(
-        None, "FILE", "Subtitles with vehicles, nearest distance and events, second by second: .srt or .ass."
+        "FILE", "Subtitles with vehicles, nearest distance and events, second by second: .srt or .ass."
     )
     preset: str = shared.PRESET
-    crf: int | None = shared.output(None, "N", "Quality of the video, 0 (best) to 51; default: 23.")
+    crf: int | None = shared.output("N", "Quality of the video, 0 (best) to 51; default: 23.")
     encoder: str = shared.output(
-        "x264", "NAME", "x264, nvenc, vaapi, videotoolbox, or auto: a graphics processor's if one works."
+        "NAME",
+        "x264, nvenc, vaapi, videotoolbox, or auto: a graphics processor's if one works.",
+        default="x264",
     )
     no_audio: bool = shared.NO_AUDIO
     quiet: bool = shared.output_flag("-q", "Print errors and warnings of damage only.", "--quiet")
     profile: bool = shared.output_flag("--profile", "Print the processor time and the waiting of each stage.")
-    start: str | None = shared.source(None, "TIME", "Start time, such as 12.5 (seconds) or 12:30.")
-    end: str | None = shared.source(None, "TIME", "End time, such as 30 (seconds) or 1:02:06.")
+    start: str | None = shared.source("TIME", "Start time, such as 12.5 (seconds) or 12:30.")
+    end: str | None = shared.source("TIME", "End time, such as 30 (seconds) or 1:02:06.")
     fps: float | None = shared.source(
-        None, "N", "Frame rate of images, a raw stream such as .h264, a pipe or a camera, such as 10."
+        "N", "Frame rate of images, a raw stream such as .h264, a pipe or a camera, such as 10."
     )
     stream: int | None = shared.source(
-        None, "N", "Video stream of a file with several, by ffmpeg's number, such as 1."
+        "N", "Video stream of a file with several, by ffmpeg's number, such as 1."
     )
     own_speed: str | None = shared.source(
-        None, "SPEED", "Own speed in km/h, such as 100, or 62mph, for headways and speeds over ground."
+        "SPEED", "Own speed in km/h, such as 100, or 62mph, for headways and speeds over ground."
     )
     gpx: Path | None = shared.source(
-        None,
         "FILE",
         "Own speed over time: a GPX track, NMEA sentences, or a .csv table with time_s and speed_kmh.",
     )
     gpx_offset: float = shared.source(
-        0.0,
         "S",
         "Time of the video's start in --gpx: seconds after the first point of a track, or the "
         "time_s of a table, such as 12.5 or -3.",
+        default=0.0,
     )
     live: bool = shared.source_flag(
         "--live", "Drop frames of a pipe rather than lag; default for cameras and streams."
@@ -116,7 +114,7 @@ class VideoOptions:
     fov: float | None = shared.FIELD_OF_VIEW
     camera_height: float | None = shared.CAMERA_HEIGHT
     horizon: str | None = shared.camera(
-        None, "F|auto", f'{shared.HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.'
+        "F|auto", f'{shared.HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.'
     )
     model: str = shared.MODEL
     classes: str | None = shared.CLASSES
@@ -124,20 +122,20 @@ class VideoOptions:
     conf: float | None = shared.CONFIDENCE
     every: int | None = shared.EVERY
     jobs: int | None = shared.search(
-        None, "N", "Frames searched in parallel, such as 2; default: one per core, at most 4."
+        "N", "Frames searched in parallel, such as 2; default: one per core, at most 4."
     )
     labels: str = shared.drawing(
-        "id,distance,speed",
         "LIST",
         "Fields of the labels: some of id,distance,speed,score,std, such as id,distance; or none.",
+        default="id,distance,speed",
     )
     line_width: int | None = shared.LINE_WIDTH
-    color_by: str = shared.drawing("id", "id|distance", "What the colors of the boxes stand for.")
+    color_by: str = shared.drawing("id|distance", "What the colors of the boxes stand for.", default="id")
     panel: str = shared.drawing(
-        "none", "corner|side|none", "Bird's-eye view in the frame's corner, or beside it."
+        "corner|side|none", "Bird's-eye view in the frame's corner, or beside it.", default="none"
     )
     units: str = shared.drawing(
-        "metric", "metric|imperial", "Labels, subtitles and report in m and km/h, or ft and mph."
+        "metric|imperial", "Labels, subtitles and report in m and km/h, or ft and mph.", default="metric"
     )
     blur: str | None = shared.BLUR
     diagnostics: bool = shared.drawing_flag(
