@@ -96,8 +96,7 @@ class VideoOptions:
         "SPEED", "Own speed in km/h, such as 100, or 62mph, for headways and speeds over ground."
     )
     gpx: Path | None = shared.source(
-        "FILE",
-        "Own speed over time: a GPX track, NMEA sentences, or a .csv table with time_s and speed_kmh.",
+        "FILE", "Own speed over time: a GPX track, NMEA sentences, or a .csv table with time_s and speed_kmh."
     )
     gpx_offset: float = shared.source(
         "S",
@@ -342,10 +341,7 @@ def _warn_of_camera(
         given = f"the horizon of --camera {options.camera}"
     else:
         return
-    with (
-        options.open_source() as again,
-        rows.search_everywhere(detector.model, options.conf) as everywhere,
-    ):
+    with options.open_source() as again, rows.search_everywhere(detector.model, options.conf) as everywhere:
         rows.warn_of_horizon(given, estimate_video_horizon(again, everywhere, **options.span()))
 
 
