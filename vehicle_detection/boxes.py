@@ -281,10 +281,8 @@ def select_classes(found: Detections, class_ids: Collection[int]) -> Detections:
         return found[np.isin(found.class_ids, list(class_ids))]
     if not len(found):
         return found
-    raise InvalidInputError(
-        f"class_ids needs an integer class for each of {pluralize(len(found), 'box', 'es')}, got None; omit "
-        "it, or return (boxes, scores, classes)"
-    )
+    must = f"come with an integer class for each of {pluralize(len(found), 'box', 'es')}"
+    raise invalid("class_ids", must, None, "omit it, or return (boxes, scores, classes)")
 
 
 def box_areas(boxes: NDArray[Any]) -> Floats:
@@ -421,10 +419,9 @@ def log_odds(scores: ArrayLike, score: ScoreScale, threshold: float | None = Non
     if score == "logit":
         return values - (0.0 if threshold is None else threshold)
     if values.size and (values.min() < 0 or values.max() > 1):
-        raise InvalidInputError(
-            f'scores must be 0 to 1 with score="probability", got {values.min():g} to {values.max():g}; pass '
-            'score="logit" for log-odds, or score=(low, high)'
-        )
+        got = f"{values.min():g} to {values.max():g}"
+        remedy = 'pass score="logit" for log-odds, or score=(low, high)'
+        raise InvalidInputError(f'scores must be 0 to 1 with score="probability", got {got}; {remedy}')
     limit = 0.5 if threshold is None else threshold
     # Probabilities of exactly 0 and 1 have no finite log-odds.
     p = values.clip(1e-3, 1 - 1e-3)

@@ -101,10 +101,8 @@ def _check_model(model: Any) -> Model:
         raise invalid("model", "not be a function", model, "pass it to detector_from")
     if hasattr(model, "predict") and not isinstance(model, VehicleClassifier):
         argument = "pipeline" if hasattr(model, "steps") else "(classifier, scaler)"
-        raise InvalidInputError(
-            f"model must not be an estimator of scikit-learn, got {check.describe(model)}; convert it with "
-            f"VehicleClassifier.from_pipeline({argument}, params), or use HeatmapDetector"
-        )
+        remedy = f"convert it with VehicleClassifier.from_pipeline({argument}, params)"
+        raise invalid("model", "not be an estimator of scikit-learn", model, remedy)
     if isinstance(model, type) or not hasattr(model, "open_search"):
         raise invalid("model", "be a name, a model file, or what load_model returns", model, "omit it")
     return cast(Model, model)

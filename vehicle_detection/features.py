@@ -114,10 +114,8 @@ class FeatureParams(fields.Checked):
         if not isinstance(self.hog_channel, str):  # 1.0 and True are equal to 1
             object.__setattr__(self, "hog_channel", check.integer(self.hog_channel, "hog_channel", low=0))
         if self.coarse_hog and self.cells // 2 < self.cell_per_block:
-            raise InvalidInputError(
-                f"coarse_hog must be False, because a block of {self.cell_per_block} cells of "
-                f"{2 * self.pix_per_cell} pixels does not fit into a patch; got True"
-            )
+            block = f"a block of {self.cell_per_block} cells of {2 * self.pix_per_cell} pixels"
+            raise invalid("coarse_hog", f"be False, because {block} does not fit into a patch", True)
 
     @classmethod
     def preset(cls, name: str) -> FeatureParams:

@@ -110,10 +110,8 @@ class FunctionModel:
     def with_confidence(self, conf: float) -> FunctionModel:
         """Return the model with the threshold at this probability."""
         if isinstance(self.score, tuple):
-            raise InvalidInputError(
-                f"conf must be None for scores on a scale of their own, got {conf:g}; change the lower end "
-                "of score=(low, high), or return probabilities"
-            )
+            remedy = "change the lower end of score=(low, high), or return probabilities"
+            raise invalid("conf", "be None for scores on a scale of their own", conf, remedy)
         return dataclasses.replace(self, threshold=conf if self.score == "probability" else logit(conf))
 
     def open_search(self, jobs: int | None = None) -> FunctionSearch:
@@ -128,23 +126,19 @@ class FunctionModel:
 
     def find(self, frame: NDArray[np.uint8]) -> Detections:
         """Call the function on a copy of a frame: boxes clipped to it, with log-odds."""
-        height, width = frame.shape[:2]
+        place = f"a frame of {frame.shape[1]}x{frame.shape[0]} pixels"
         try:
             assert self._lock is not None
             with self._lock:
                 returned = self.function(frame.copy())
         except Exception as error:
-            raise DetectorError(
-                f"the function {self.name} failed on a frame of {width}x{height} pixels: "
-                f"{type(error).__name__}: {error}"
-            ) from error
+            reason = f"{type(error).__name__}: {error}"
+            raise DetectorError(f"the function {self.name} failed on {place}: {reason}") from error
         try:
             found = self._convert(returned)
         except InvalidInputError as error:
-            raise DetectorError(
-                f"the function {self.name} returned an invalid result for a frame of {width}x{height} "
-                f"pixels: {error}"
-            ) from error
+            wrong = f"the function {self.name} returned an invalid result"
+            raise DetectorError(f"{wrong} for {place}: {error}") from error
         clipped = found.with_columns(boxes=clip_boxes(found.boxes.astype(np.float64), frame.shape))
         return clipped[box_areas(clipped.boxes) > 0]
 
@@ -169,10 +163,8 @@ class FunctionModel:
             raise invalid("it", "be (boxes, scores) or (boxes, scores, classes)", returned, remedy)
         boxes = found.boxes
         if boxes.size and boxes.min() >= 0 and boxes.max() <= 1 and (box_areas(boxes) > 0).any():
-            raise InvalidInputError(
-                f"boxes must be in pixels, got {boxes.min():g} to {boxes.max():g}, as fractions of the frame "
-                "are; multiply x by its width and y by its height"
-            )
+            got = f"{boxes.min():g} to {boxes.max():g}, as fractions of the frame are"
+            raise InvalidInputError(f"boxes must be in pixels, got {got}; multiply by its width and height")
         return found
 
 

@@ -33,6 +33,7 @@ _MAX_UNIT_SUM, _MAX_FLOAT_MEAN, _GRAY = 2.5, 64.0, 128.0
 # windows of a frame show no vehicle.
 _BOX_CALIBRATION = Platt(-6.29, 5.74)
 
+_OR_ELSE = "search with vehicle_detection.course, which accepts any scikit-learn estimator"
 CLASSIFIER_REMEDY = "load_classifier, train_classifier or VehicleClassifier.from_pipeline make one"
 
 
@@ -107,10 +108,8 @@ class VehicleClassifier:
         for template in self.templates:
             check.instance(template, "templates", Template, CLASSIFIER_REMEDY)
             if template.coef.shape != (self.params.length,):
-                raise InvalidInputError(
-                    f"templates must have {self.params.length} weights, the length of the features; "
-                    f"got {len(template.coef)}"
-                )
+                must = f"have {self.params.length} weights, the length of the features"
+                raise invalid("templates", must, len(template.coef))
 
     @property
     def calibration(self) -> Platt:
@@ -321,11 +320,9 @@ def _scaling(scaler: Any, length: int) -> tuple[NDArray[np.float64], NDArray[np.
     """Offset and factor of a fitted scaler, which computes ``(x - offset) / factor``."""
     name = type(scaler).__name__
     if name not in _SCALERS:
-        raise InvalidInputError(
-            f"pipeline must hold only {', '.join(_SCALERS)} before the classifier; got {name}, which does "
-            "not scale each feature by itself. Train with one of these, or search with "
-            "vehicle_detection.course, which accepts any scikit-learn estimator"
-        )
+        must = f"hold only {', '.join(_SCALERS)} before the classifier"
+        reason = "which does not scale each feature by itself"
+        raise InvalidInputError(f"pipeline must {must}; got {name}, {reason}; train again, or {_OR_ELSE}")
     fitted = n_features(scaler)
     if fitted is None:
         raise InvalidInputError(f"pipeline must be fitted; its {name} is not: call fit first")
@@ -352,10 +349,8 @@ def _weights(classifier: Any, length: int) -> tuple[NDArray[np.float64], float]:
     if not hasattr(classifier, "classes_"):
         raise InvalidInputError(f"pipeline must be fitted; its {name} is not: call fit first")
     if not hasattr(classifier, "coef_") or not hasattr(classifier, "decision_function"):
-        raise InvalidInputError(
-            f"pipeline must end in a linear classifier, such as LinearSVC; got {name}. Search with "
-            "vehicle_detection.course, which accepts any scikit-learn estimator"
-        )
+        must = "end in a linear classifier, such as LinearSVC"
+        raise InvalidInputError(f"pipeline must {must}; got {name}; {_OR_ELSE}")
     labels = list(classifier.classes_)
     if labels not in ([0, 1], [-1, 1]):
         must = "be fitted on the labels 0 or -1 for others and 1 for vehicles"

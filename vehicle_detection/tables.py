@@ -243,10 +243,8 @@ class TrackTable:
             raise InvalidInputError("append needs a table that was empty at first; start with TrackTable()")
         first = int(self._keys[-1]) + 1 if self._keys else 0
         if frame < first:
-            raise InvalidInputError(
-                f"frame must be at least {first}, as frames are added in order; got {frame}; "
-                "use a new TrackTable for another video"
-            )
+            must, remedy = f"be at least {first}, as frames are added in order", "use a table for each video"
+            raise invalid("frame", must, frame, remedy)
         if time is not None:
             time = check.number(time, "time", low=-1e12, high=1e12)
         shown = shown_tracks(tracks)
@@ -539,10 +537,9 @@ def check_classes(
     """Refuse a file in which no class is that of vehicles: it would have no box."""
     if not any(name in wanted for name in found):
         listed = shorten(", ".join(map(repr, sorted(found))), 300) or "none"
-        raise DatasetError(
-            f"{source} has no {kind} among {', '.join(sorted(wanted))}; found {listed}; "
-            "name those of vehicles with classes="
-        )
+        names = ", ".join(sorted(wanted))
+        remedy = "name those of vehicles with classes="
+        raise DatasetError(f"{source} has no {kind} among {names}; found {listed}; {remedy}")
 
 
 def parse_number(cell: Any, name: str, place: str) -> float:

@@ -128,14 +128,12 @@ def _conversion_to_uint8(values: NDArray[Any], name: str) -> str:
 def patches(values: object, size: int, name: str = "patches") -> NDArray[np.uint8]:
     """Return `values` as an ``(N, size, size, 3)`` uint8 array; a list of such images is stacked."""
     values = getattr(values, "patches", values)  # of a PatchSet
+    resize = f"resize each image with cv2.resize(image, ({size}, {size}))"
     if isinstance(values, (list, tuple)):
         images = [image(patch, f"{name}[{index}]") for index, patch in enumerate(values)]
         for index, each in enumerate(images):
             if each.shape != (size, size, 3):
-                raise InvalidInputError(
-                    f"{name}[{index}] must be {size}x{size} pixels, got {each.shape[1]}x{each.shape[0]}; "
-                    f"resize it with cv2.resize(image, ({size}, {size}))"
-                )
+                raise invalid(f"{name}[{index}]", f"be {size}x{size} pixels", each, resize)
         return np.stack(images) if images else np.empty((0, size, size, 3), np.uint8)
     remedy = "read a folder or zip with vehicle_detection.load_patches"
     if isinstance(values, np.ndarray):
@@ -146,7 +144,7 @@ def patches(values: object, size: int, name: str = "patches") -> NDArray[np.uint
         elif values.shape == (size, size, 3):
             remedy = f"pass a single patch as {name}[None]"
         elif values.ndim in (3, 4):
-            remedy = f"resize each image with cv2.resize(image, ({size}, {size}))"
+            remedy = resize
     raise invalid(name, f"be an (N, {size}, {size}, 3) uint8 RGB array or a list of images", values, remedy)
 
 
@@ -216,20 +214,17 @@ def boxes(values: Any, name: str = "boxes") -> NDArray[Any]:
             remedy = "pass [track.box for track in tracks]"
         elif hasattr(values, "astype") and found.dtype == object:
             remedy = "convert columns that may hold NA with table.astype(float)"
-        raise InvalidInputError(
-            f"{name} must be an (N, 4) number array of [x1, y1, x2, y2] or corner pairs "
-            f"((x1, y1), (x2, y2)), got {describe(values)}; {remedy}"
-        )
+        must = "be an (N, 4) number array of [x1, y1, x2, y2] or corner pairs ((x1, y1), (x2, y2))"
+        raise invalid(name, must, values, remedy)
     if not ((found >= -_MAX_PIXEL) & (found <= _MAX_PIXEL)).all():
         what = f"values beyond {_MAX_PIXEL:g}" if np.isfinite(found).all() else "NaN or infinity"
         raise InvalidInputError(f"{name} must be finite, got {what}; drop those rows")
     inverted = (found[:, 2] < found[:, 0]) | (found[:, 3] < found[:, 1])
     if inverted.any():
         row = int(np.argmax(inverted))
-        raise InvalidInputError(
-            f"{name} must be [x1, y1, x2, y2] with x1 <= x2 and y1 <= y2, got {found[row].tolist()} in row "
-            f"{row}; boxes given as [x, y, width, height] need x + width and y + height"
-        )
+        must = "be [x1, y1, x2, y2] with x1 <= x2 and y1 <= y2"
+        remedy = "boxes given as [x, y, width, height] need x + width and y + height"
+        raise invalid(f"{name}[{row}]", must, found[row].tolist(), remedy)
     return found
 
 

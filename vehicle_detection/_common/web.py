@@ -48,10 +48,7 @@ def download_bytes(url: str, limit: Limit) -> bytes:
         for chunk in read_http(url):
             data += chunk
             if len(data) > limit.current():
-                raise InvalidInputError(
-                    f"URL {name} holds more than {limit.current():,} bytes; if it is meant to, set "
-                    f"{limit.variable}"
-                )
+                raise InvalidInputError(limit.exceeded(f"URL {name}"))
     except FileNotFoundError:
         raise InvalidInputError(f"URL {name} does not exist; check the address") from None
     except (OSError, HTTPError) as error:

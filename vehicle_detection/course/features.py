@@ -97,10 +97,9 @@ def convert_color(img: Image, conv: str = "RGB2YCrCb", *, color_space: str | Non
     names = str(conv).upper().rpartition("2")
     source, target = (_OPENCV_SPACES.get(name) for name in (names[0] or "RGB", names[2]))
     if source in (None, "GRAY") or target is None or {source, target}.isdisjoint({"RGB", "BGR"}):
-        raise InvalidInputError(
-            f"conv or color_space must be RGB2 or BGR2 and one of {', '.join(_OPENCV_SPACES.values())}, or "
-            f"an inverse such as HSV2RGB; got {describe(conv)}"
-        )
+        names = ", ".join(_OPENCV_SPACES.values())
+        must = f"be RGB2 or BGR2 and one of {names}, or an inverse such as HSV2RGB"
+        raise invalid("conv or color_space", must, conv)
     if source == target:
         return image.copy()
     return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_{source}2{target}")))

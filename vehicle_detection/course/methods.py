@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check, describe
+from vehicle_detection._common import check, invalid
 from vehicle_detection.course.search import find_car_windows, scale_values, search_windows
 from vehicle_detection.course.versions import lesson_defaults
 from vehicle_detection.course.windows import Corners, slide_window
@@ -40,10 +40,8 @@ def read_bands(scales: Sequence[Any], rows: Sequence[int]) -> list[_Band]:
         scale, *own = each if isinstance(each, tuple) else (each,)
         pairs = [*own, *usual[len(own) :]]
         if len(pairs) > 2 or not all(_is_range(pair) for pair in pairs):
-            raise InvalidInputError(
-                "scales must hold numbers, or (scale, (ystart, ystop), (xstart, xstop)) with start < stop; "
-                f"got {describe(each)} and y_start_stop={describe(rows)}"
-            )
+            must = "hold numbers, or (scale, (ystart, ystop), (xstart, xstop)) with start < stop"
+            raise invalid("scales and y_start_stop", must, (each, rows))
         bands.append((check.number(scale, "scales", low=0.25, high=20), pairs[0], pairs[1]))
     if not bands:
         raise InvalidInputError("scales must hold a number at least, such as (1.0, 1.5); got none")
@@ -65,10 +63,8 @@ def window_search(
     if isinstance(clf, VehicleClassifier):
         step = options.pop("cells_per_step", 2)
         if scaler is not None or options:
-            raise InvalidInputError(
-                "scaler and options of the features must be omitted with a model of the library, which "
-                f"contains them; got {describe(scaler)} and {sorted(options)}"
-            )
+            must = "be omitted with a model of the library, which contains them"
+            raise invalid("scaler and options of the features", must, (scaler, sorted(options)))
         if method == 1:
             return lambda image: search_library_windows(image, _list_windows(image), clf).boxes
         params = _search_params(bands, check.integer(step, "cells_per_step", low=1, high=8))
@@ -77,10 +73,8 @@ def window_search(
         return clf  # type: ignore[no-any-return]
     scaled = hasattr(scaler, "transform") or (scaler is None and hasattr(clf, "steps"))
     if not hasattr(clf, "predict") or not scaled:
-        raise InvalidInputError(
-            "clf must be a model of the library, a function of an image, or a fitted classifier with a "
-            f"scaler; got {describe(clf)} and {describe(scaler)}; pass the scaler, or a pipeline of both"
-        )
+        must = "be a model of the library, a function of an image, or a fitted classifier with a scaler"
+        raise invalid("clf", must, (clf, scaler), "pass the scaler, or a pipeline of both")
     # Later changes of the defaults must not change a detector.
     options = {**_FEATURES, **{name: lesson_defaults[name] for name in _FROZEN}, **options}
     # An image of one window checks the options, the estimators and the range before the first frame.

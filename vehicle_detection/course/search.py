@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import describe, fields
+from vehicle_detection._common import describe, fields, invalid
 from vehicle_detection.course.features import (
     FeatureOptions,
     Image,
@@ -116,10 +116,8 @@ def search_windows(
     valid &= (corners[:, 2:] > corners[:, :2]).all(axis=1)
     if not valid.all():
         row = int(np.argmin(valid))
-        raise InvalidInputError(
-            f"windows must be non-empty and start inside the {width}x{height} image; got "
-            f"{corners[row].tolist()} in row {row}"
-        )
+        must = f"be non-empty and start inside the {width}x{height} image"
+        raise invalid(f"windows[{row}]", must, corners[row].tolist())
     rows = box_rows(windows)
     found: list[Any] = []
     for start in range(0, len(corners), _CHUNK):
@@ -284,10 +282,8 @@ class _SearchOptions(FeatureOptions):
         """Rows of the band, clipped to the image's height."""
         top, bottom = self.ystart or 0, height if self.ystop is None else min(height, self.ystop)
         if top >= bottom:
-            raise InvalidInputError(
-                f"ystart and ystop must be a range of the image's {height} rows; got {self.ystart} and "
-                f"{self.ystop}"
-            )
+            rows = self.ystart, self.ystop
+            raise invalid("ystart and ystop", f"be a range of the image's {height} rows", rows)
         return top, bottom
 
 
@@ -414,10 +410,8 @@ def _read_estimators(clf: Any, scaler: Any, options: FeatureOptions, state: list
                     f"the {name} must be fitted; got an unfitted {type(estimator).__name__}: call fit first"
                 ) from None
     if options.hog_feat and options.blocks < 1:
-        raise InvalidInputError(
-            f"a block of {options.cell_per_block} cells of {options.pix_per_cell} pixels must fit into a "
-            f"window of {PATCH_SIZE} pixels"
-        )
+        block = f"a block of {options.cell_per_block} cells of {options.pix_per_cell} pixels"
+        raise InvalidInputError(f"{block} must fit into a window of {PATCH_SIZE} pixels")
     first, name = (clf, "classifier") if scaler is None else (scaler, "scaler")
     fitted = n_features(first)
     if fitted not in (None, options.length):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vehicle_detection._common import Limit, check, describe, parse_yaml, read_regular_file
+from vehicle_detection._common import Limit, check, describe, invalid, parse_yaml, read_regular_file
 from vehicle_detection.boxes import clip_boxes, logit
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import DatasetError, InvalidInputError
@@ -143,10 +143,8 @@ def read_coco(
             category = entry["category_id"]
             frame, name = file.images[entry["image_id"]], file.categories[category]
         except (KeyError, TypeError, ValueError) as error:
-            raise DatasetError(
-                f"{where}: expected bbox [x, y, width, height] and the image_id and category_id of an image "
-                f"and a category in the file ({error})"
-            ) from None
+            expected = "bbox [x, y, width, height], and image_id and category_id of an image and a category"
+            raise DatasetError(f"{where}: expected {expected} in the file ({error})") from None
         if category not in vehicles and name not in LOOKALIKE_CLASSES:
             continue
         entry = _with_attributes(entry)
@@ -294,10 +292,8 @@ _TRACKS_ALONE = "tracks without confidences; write those too (save_conf=True of 
 def read_yolo(source: Path, classes: Collection[str] | None, shape: Any, images: FrameSet | None) -> FileRows:
     """Read a text file for each frame; the names of the classes are beside their folder, or unknown."""
     if shape is None and images is None:
-        raise InvalidInputError(
-            "shape must be (height, width) of the frames for YOLO, got None; pass it, or the folder of "
-            "the images as images= or --images"
-        )
+        remedy = "pass it, or the folder of the images as images= or --images"
+        raise invalid("shape", "be (height, width) of the frames for YOLO", None, remedy)
     inner = [each for each in (source / "labels", *source.glob("obj_*_data")) if each.is_dir()]  # or of CVAT
     if len(inner) > 1:
         raise DatasetError(f"{source} holds {inner[0].name} and {inner[1].name}; name one of them")
@@ -363,16 +359,12 @@ def _yolo_record(where: str, words: list[str], shape: tuple[int, ...]) -> tuple[
     """Class and record of a line: class, center, size and, for predictions, confidence and track."""
     if not 5 <= len(words) <= 7:
         outline = "; export boxes, not outlines or rotated boxes" if len(words) > 8 else ""
-        raise DatasetError(
-            f"{where}: expected class, center and size, and perhaps confidence and track, found {len(words)} "
-            f"values{outline}"
-        )
+        expected = "class, center and size, and perhaps confidence and track"
+        raise DatasetError(f"{where}: expected {expected}, found {len(words)} values{outline}")
     x, y, width, height = (parse_number(word, "side of the box", where) for word in words[1:5])
     if len(words) == 5 and not (abs(x - 0.5) < (1 + width) / 2 and abs(y - 0.5) < (1 + height) / 2):
-        raise DatasetError(
-            f"{where}: the box {' '.join(words[1:5])} lies outside the image; center and size are fractions "
-            "of the image in YOLO"
-        )
+        reason = "lies outside the image; center and size are fractions of the image in YOLO"
+        raise DatasetError(f"{where}: the box {' '.join(words[1:5])} {reason}")
     x, width, y, height = x * shape[1], width * shape[1], y * shape[0], height * shape[0]
     corners = np.array([[x - width / 2, y - height / 2, x + width / 2, y + height / 2]])
     record: Record = dict(zip(CORNERS, clip_boxes(corners, shape)[0].tolist()))

@@ -168,10 +168,8 @@ def _read_kitti(source: Path, classes: Collection[str] | None) -> FileRows:
 def _kitti_record(where: str, words: list[str], classes: Collection[str] | None) -> Record | None:
     """One KITTI object; None for a person. One without `occluded` is a region."""
     if len(words) not in (15, 16):
-        raise DatasetError(
-            f"{where}: a KITTI object has 15 values (16 with a score; 2 more before them with tracks), found "
-            f"{len(words)}"
-        )
+        expected = "15 values (16 with a score; 2 more before them with tracks)"
+        raise DatasetError(f"{where}: a KITTI object has {expected}, found {len(words)}")
     name = words[0].lower()
     corners = [parse_number(word, "corner of the box", where) for word in words[4:8]]
     score = words[15] if len(words) == 16 else None
@@ -245,10 +243,8 @@ def _read_mot_zip(source: Path, classes: Collection[str] | None) -> FileRows:
     """Read an archive of CVAT: MOTChallenge text whose pixels count from 0, and the names of the classes."""
     text, names = _read_members(source, "gt/gt.txt", "gt/labels.txt")
     if text is None:
-        raise DatasetError(
-            f"{source} is not an archive of CVAT: it lacks gt/gt.txt; export MOT 1.1 there, or unpack an "
-            "archive of another format"
-        )
+        remedy = "export MOT 1.1 there, or unpack an archive of another format"
+        raise DatasetError(f"{source} is not an archive of CVAT: it lacks gt/gt.txt; {remedy}")
     wanted = VEHICLE_CLASSES if classes is None else classes
     labels = [name.strip().lower() for name in (names or "").splitlines() if name.strip()]
     if labels:
@@ -417,10 +413,9 @@ def _table_of(
         columns["boxes"] = clip_boxes(boxes, shape)
         gone = np.flatnonzero((columns["boxes"][:, :2] == columns["boxes"][:, 2:]).any(axis=1))
         if gone.size and labelled:
-            raise DatasetError(
-                f"{places[gone[0]]}: box {boxes[gone[0]].tolist()} lies outside the {shape[1]}x{shape[0]} "
-                "image; check that shape is (height, width) of these frames"
-            )
+            box, size = boxes[gone[0]].tolist(), f"{shape[1]}x{shape[0]}"
+            remedy = "check that shape is (height, width) of these frames"
+            raise DatasetError(f"{places[gone[0]]}: box {box} lies outside the {size} image; {remedy}")
     return TrackTable(**columns | {"frame_keys": (*columns["frame_keys"], *found.frames)})
 
 
@@ -448,10 +443,8 @@ def _guess_format(source: Path) -> str:
     if start.startswith(("{", "[")):
         return "coco"
     if start.startswith("<"):
-        raise DatasetError(
-            f"{source} is XML, as of CVAT or Pascal VOC, which is not read; export COCO, or from CVAT also "
-            "YOLO 1.1 or MOT 1.1"
-        )
+        remedy = "export COCO, or from CVAT also YOLO 1.1 or MOT 1.1"
+        raise DatasetError(f"{source} is XML, as of CVAT or Pascal VOC, which is not read; {remedy}")
     if len(words) in (17, 18) and words[2].isalpha():
         return "kitti"
     if not words or re.fullmatch(r"[0-9]+(\.0*)?", words[0]):

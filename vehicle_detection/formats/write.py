@@ -174,10 +174,8 @@ def _folder_writer(
     def write(frame: FrameKey, records: Sequence[Record]) -> None:
         other = frames.setdefault(name(frame), frame)
         if other != frame:
-            raise InvalidInputError(
-                f"path cannot hold the frames {other!r} and {frame!r}, which are one file in {kind}; "
-                "rename them"
-            )
+            pair = f"{other!r} and {frame!r}, which are one file in {kind}"
+            raise InvalidInputError(f"path cannot hold the frames {pair}; rename them")
         with (folder / f"{name(frame)}.txt").open("a", encoding="utf-8", newline="") as file:
             file.writelines(map(line, records))
 
@@ -278,10 +276,8 @@ def _check_format(path: object, name: str | None, allowed: Iterable[str]) -> str
     kind = FORMATS.get(Path(path).suffix.lower()) if name is None else name
     if name is None and kind not in choices:
         suffixes = [suffix for suffix, meant in FORMATS.items() if meant in choices]
-        raise InvalidInputError(
-            f"path must end in {', '.join(suffixes)}, got {Path(path).name!r}; "
-            f"or set the format to {', '.join(map(repr, choices))}"
-        )
+        remedy = f"or set the format to {', '.join(map(repr, choices))}"
+        raise invalid("path", f"end in {', '.join(suffixes)}", Path(path).name, remedy)
     check.choice(kind, "format", choices)
     if kind not in FOLDER_FORMATS:
         check_target(path, "path")
@@ -301,10 +297,8 @@ class TrackStream:
         records = track_records(result)
         frame = int(result.index)
         if frame <= self._last:
-            raise InvalidInputError(
-                f"frame must be greater than {self._last}, the last one, got {frame}; "
-                "write each frame once, and each video to a file of its own"
-            )
+            remedy = "write each frame once, and each video to a file of its own"
+            raise invalid("frame", f"be greater than {self._last}, the last one", frame, remedy)
         self._last = frame
         time = None if self._fps is None else round(frame / self._fps, DIGITS[TIME_COLUMN])
         self._write(frame, [{**record, TIME_COLUMN: time} for record in records])
@@ -464,10 +458,8 @@ def write_labels(
         raise InvalidInputError(f"truth must be None for the format {kind!r}; only COCO files have image ids")
     _check_holds(labels, kind, shape)
     if truth is None and kind == "coco_results":
-        raise InvalidInputError(
-            "truth must name the COCO ground truth, whose image ids the results refer to, got None; "
-            "write it with write_labels, too"
-        )
+        must = "name the COCO ground truth, whose image ids the results refer to"
+        raise invalid("truth", must, None, "write it with write_labels, too")
     named = any(isinstance(key, str) for key in labels.frame_keys)
     found = None
     if truth is not None:

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import Floats, check
+from vehicle_detection._common import Floats, check, invalid
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera, FrameShape, lateral_offsets, truncated_edges
-from vehicle_detection.errors import InvalidInputError
 
 # Times (s): correlation of the errors of a vehicle's boxes; decay of the sums; faster decay of the sums where
 # no vehicle fits them.
@@ -190,10 +189,8 @@ def estimate_horizon(
     array = check.boxes(boxes).astype(np.float64)
     whole = array[~truncated_edges(array, frame).any(axis=1)]
     if len(whole) < _MIN_BOXES:
-        raise InvalidInputError(
-            f"boxes must contain {_MIN_BOXES} vehicles that are not truncated by the frame, got "
-            f"{len(whole)}; use more frames"
-        )
+        must = f"contain {_MIN_BOXES} vehicles that are not truncated by the frame"
+        raise invalid("boxes", must, len(whole), "use more frames")
     height, height_std = _CAMERA_HEIGHT, _CAMERA_HEIGHT_STD
     if height_m is not None:
         height = check.number(height_m, "height_m", above=0, high=100)

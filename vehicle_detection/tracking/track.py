@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import Floats, fields, invalid, pluralize
 from vehicle_detection.boxes import Detections
-from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
     import pandas
@@ -106,10 +105,8 @@ class TrackParams(fields.Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.show_coast > self.max_coast:
-            raise InvalidInputError(
-                f"show_coast must be at most max_coast, because a track that ended is not shown; "
-                f"got {self.show_coast:g} and {self.max_coast:g}; change both"
-            )
+            must = f"be at most max_coast, {self.max_coast:g}: a track that ended is not shown"
+            raise invalid("show_coast", must, self.show_coast, "change both")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
