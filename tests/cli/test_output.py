@@ -1,10 +1,16 @@
+import _thread
 import os
+import signal
+import sys
+import threading
+import time
 
 import pytest
 
+from tests.helpers import failing
 from vehicle_detection._common import progress_bar
 from vehicle_detection.cli import output
-from vehicle_detection.cli.output import check_distinct_paths, print_error, print_table
+from vehicle_detection.cli.output import check_distinct_paths, print_error, print_table, run_interruptible
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -44,3 +50,22 @@ def test_control_characters_of_names_are_escaped(capsys):
     assert err == "error: a\\x1b[2J\\u202eb\\x9b.mp4 is missing\n"
     assert all(name in out for name in ("c\\x1b]0;title\\x07", "d\\x1b[1m", "f\\rg"))
     assert "\x1b" not in out
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGUSR1")
+def test_a_signal_right_before_the_wait_for_a_computation_is_noticed():
+    """Like `interrupt_main`, it does not end a wait."""
+    before, ended, late = signal.signal(signal.SIGUSR1, failing(KeyboardInterrupt())), threading.Event(), []
+
+    def compute():
+        time.sleep(0.5)  # until the wait has begun
+        _thread.interrupt_main(signal.SIGUSR1)
+        late.append(not ended.wait(5))
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_interruptible(compute)
+        assert not late
+    finally:
+        ended.set()
+        signal.signal(signal.SIGUSR1, before)

@@ -29,8 +29,8 @@ DAMAGED = 3  # exit code of a command that left out what it could not decode
 
 Result = TypeVar("Result")
 
-# Name of a thread that `run_interruptible` has abandoned.
-_ABANDONED = "abandoned"
+# Name of a thread that `run_interruptible` has abandoned, and seconds that it waits at a time.
+_ABANDONED, _WAIT = "abandoned", 0.2
 
 # Width of tables that are not printed to a terminal; fits a fingerprint in one line.
 _PIPE_WIDTH = 120
@@ -272,6 +272,8 @@ def run_interruptible(function: Callable[[], Result]) -> Result:
     thread = threading.Thread(target=work, daemon=True)
     try:
         thread.start()
+        while thread.is_alive():  # a signal that arrives right before the wait does not end it
+            thread.join(_WAIT)
         return outcome.result()
     except BaseException:
         if not outcome.done():
