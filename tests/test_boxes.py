@@ -160,7 +160,7 @@ def test_confidences_are_probabilities():
         ([], [1], "scores must be one number for each of the 0 boxes"),
         ([[0, 0, 1, 1]], [1, 2], "scores must be one number for each of the 1 boxes"),
         ([[0, 0, 1, 1]], [np.inf], "scores must be finite, got NaN or infinity"),
-        ([[1, 0, 0, 1]], [1], "boxes must be .* x1 <= x2"),
+        ([[1, 0, 0, 1]], [1], r"boxes\[0\] must be .* x1 <= x2"),
     ],
 )
 def test_detections_reject_invalid_columns(boxes, scores, message):
@@ -209,10 +209,14 @@ def test_detections_of_supervision_are_converted():
 @pytest.mark.parametrize(
     ("given_", "options", "message"),
     [
-        ([TWO], {}, "detections must have the attributes xyxy"),
+        ([TWO], {}, "detections must have xyxy"),
         (StandIn(TWO, [0.5, 3.0]), {}, r'0 to 1 with score="probability", got 0.5 to 3; pass score="logit"'),
         (StandIn([[9, 9, 5, 5]], [0.5]), {}, "x1 <= x2"),
-        (StandIn(TWO, [0.5, 0.5]), {"class_ids": [1]}, "class_ids needs an integer class for each of 2"),
+        (
+            StandIn(TWO, [0.5, 0.5]),
+            {"class_ids": [1]},
+            "class_ids must come with an integer class for each of 2",
+        ),
         (StandIn(TWO, [0.5, 0.5], [2, 7]), {"class_ids": 2}, "class_ids must be a sequence of integers"),
         (StandIn(TWO), {"score": (1, 1)}, r"score\[1\] must be a number, greater than 1"),
         (StandIn(TWO), {"score": (0, 1), "threshold": 0.5}, "threshold must be omitted"),

@@ -120,7 +120,7 @@ def test_pipelines_that_cannot_be_converted(patches, labels):
         (fit(PCA(4), LinearSVC()), "before the classifier; got PCA"),
         (fit(MinMaxScaler(clip=True), LinearSVC()), r"train with MinMaxScaler\(clip=False\)"),
         (fit(scaler, Squared()), "weighted sum of the features; StandardScaler and Squared"),
-        (fit(scaler, LinearSVC(C=1e-5), labels=many), "0 or -1 for others and 1 for vehicles; got .*2"),
+        (fit(scaler, LinearSVC(C=1e-5), labels=many), "0 or -1 for others and 1 for vehicles, got .*2"),
         (fit(scaler, LinearSVC(), labels=names), "must be fitted on the labels 0 or -1"),
         (fit(StandardScaler(), LinearSVC(), rows=rows[:, :5]), "features .*; its StandardScaler .* 5"),
     ):

@@ -313,7 +313,7 @@ def write_model(path, tensors=None, **changes):
         ({"0.scale": np.zeros(SMALL.length)}, "scale must be positive"),
         ({"0.coef": np.ones(5)}, "coef must be a vector of the features' length"),
         ({"0.intercept": np.zeros(2)}, "cannot reshape"),
-        ({f"0.{name}": np.ones(5) for name in ("mean", "scale", "coef")}, "must have .* weights, .*; got 5"),
+        ({f"0.{name}": np.ones(5) for name in ("mean", "scale", "coef")}, "must have .* weights, .*, got 5"),
         ({"0.mean": None}, "'0.mean'"),
         ({"extra": np.zeros(3)}, "'1.mean'"),
         (dict.fromkeys(("0.mean", "0.scale", "0.coef", "0.intercept")), "at least one template"),

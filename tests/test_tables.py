@@ -153,9 +153,9 @@ def test_selections_have_the_times_of_their_frames():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((0,), "frame must be at least 1, as frames are added in order; got 0"),
+        ((0,), "frame must be at least 1, as frames are added in order, got 0"),
         ((1, None, [5]), "tracks must be Track objects, got 5"),
-        ((1, None, [track(1), track(1)]), "tracks must have unique ids, got 1 twice"),
+        ((1, None, [track(1), track(1)]), "tracks must have unique ids, got 1; "),
     ],
 )
 def test_frames_that_cannot_be_appended(arguments, message):
@@ -236,7 +236,7 @@ def test_malformed_columns_of_a_table(change, message):
 def test_objects_that_are_no_table_of_boxes():
     table = pd.DataFrame({"frame": [0], "x1": [0]})
     for given_table, message in (
-        (5, "table must be a pandas.DataFrame with the columns frame, x1, y1, x2, y2; got 5"),
+        (5, "table must be a pandas.DataFrame with the columns frame, x1, y1, x2, y2, got 5"),
         (table, "table lacks the columns y1, x2, y2"),
         (pd.concat([table, table[["x1"]]], axis=1), "each column once; got x1 more than once"),
     ):

@@ -124,11 +124,14 @@ def test_windows_above_the_minimum_score_are_returned():
 @pytest.mark.parametrize(
     ("windows", "message"),
     [
-        ([[0, 0, 64, 64], [150, 0, 214, 64]], r"inside the 200x120 image; got \[150, 0, 214, 64\] in row 1"),
-        ([[-1, 0, 63, 64]], "in row 0; use slide_window, or clip_boxes"),
+        (
+            [[0, 0, 64, 64], [150, 0, 214, 64]],
+            r"windows\[1\] must .* inside the 200x120 image, got \[150, 0, 214, 64\]",
+        ),
+        ([[-1, 0, 63, 64]], r"windows\[0\] must .*; use slide_window, or clip_boxes"),
         ([[0, 80, 64, 144]], "inside the 200x120 image"),
-        ([[10, 10, 10, 20]], "windows must be non-empty boxes"),
-        ([[0, 0, 64, 64], [0, 0, 64.5, 64]], "windows must be whole pixels; .* in row 1; round them first"),
+        ([[10, 10, 10, 20]], "must be non-empty boxes"),
+        ([[0, 0, 64, 64], [0, 0, 64.5, 64]], r"windows\[1\] must be whole pixels, .*; round them first"),
     ],
 )
 def test_search_windows_rejects_invalid_windows(windows, message):

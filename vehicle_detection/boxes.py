@@ -471,7 +471,7 @@ class Platt(fields.Checked):
         """Return the score that has this probability, in (0, 1), for use as a threshold."""
         value = check.number(probability, "probability", above=0)
         if value >= 1 or self.a == 0:
-            raise invalid("probability", f"be in (0, 1), and a not 0 (a={self.a:g})", value)
+            raise invalid("probability", "lie in (0, 1) and a must not be 0", (value, self.a))
         return (-logit(value) - self.b) / self.a
 
 

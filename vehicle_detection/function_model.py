@@ -164,7 +164,8 @@ class FunctionModel:
         boxes = found.boxes
         if boxes.size and boxes.min() >= 0 and boxes.max() <= 1 and (box_areas(boxes) > 0).any():
             got = f"{boxes.min():g} to {boxes.max():g}, as fractions of the frame are"
-            raise InvalidInputError(f"boxes must be in pixels, got {got}; multiply by its width and height")
+            remedy = "multiply x by its width and y by its height"
+            raise InvalidInputError(f"boxes must be in pixels, got {got}; {remedy}")
         return found
 
 

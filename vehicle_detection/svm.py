@@ -351,7 +351,7 @@ def _weights(classifier: Any, length: int) -> tuple[NDArray[np.float64], float]:
     if not hasattr(classifier, "coef_") or not hasattr(classifier, "decision_function"):
         must = "end in a linear classifier, such as LinearSVC"
         raise InvalidInputError(f"pipeline must {must}; got {name}; {_OR_ELSE}")
-    labels = list(classifier.classes_)
+    labels = np.asarray(classifier.classes_).tolist()
     if labels not in ([0, 1], [-1, 1]):
         must = "be fitted on the labels 0 or -1 for others and 1 for vehicles"
         raise invalid("pipeline", must, labels)

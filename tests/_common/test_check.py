@@ -115,7 +115,7 @@ def test_check_patches_stacks_a_list():
         (np.zeros((2, 64, 64, 3), int), r"patches.astype\(numpy.uint8\) once"),
         (np.zeros((2, 6156), np.float32), "vehicle_detection.load_patches"),
         ("vehicles.zip", "vehicle_detection.load_patches"),
-        ([PATCH, IMAGE], r"patches\[1\] must be 64x64 pixels, got 6x4; resize it with cv2.resize"),
+        ([PATCH, IMAGE], r"patches\[1\] must be 64x64 pixels, .*cv2.resize"),
         ([PATCH, PATCH[..., 0]], r"patches\[1\] must be an \(H, W, 3\)"),
     ],
 )
@@ -149,12 +149,12 @@ def test_check_boxes_accepts_corner_pairs_and_detections():
         (None, r"an \(N, 4\) number array"),
         ([[0, 0, math.nan, 1]], "must be finite"),
         ([[0, 0, math.inf, 1]], "must be finite"),
-        ([[0, 0, 1, 1], [10, 10, 5, 20]], r"got \[10, 10, 5, 20\] in row 1; .* x \+ width"),
-        (np.array([[10, 10, 5, 20]], np.uint8), "in row 0"),
+        ([[0, 0, 1, 1], [10, 10, 5, 20]], r"\[1\] must be .*, got \[10, 10, 5, 20\] .* x \+ width"),
+        (np.array([[10, 10, 5, 20]], np.uint8), r"\[0\] must be"),
     ],
 )
 def test_check_boxes_refuses(boxes, message):
-    with pytest.raises(InvalidInputError, match=f"^windows .*{message}"):
+    with pytest.raises(InvalidInputError, match=f"^windows.*{message}"):
         check.boxes(boxes, "windows")
 
 

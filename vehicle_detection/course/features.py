@@ -97,8 +97,8 @@ def convert_color(img: Image, conv: str = "RGB2YCrCb", *, color_space: str | Non
     names = str(conv).upper().rpartition("2")
     source, target = (_OPENCV_SPACES.get(name) for name in (names[0] or "RGB", names[2]))
     if source in (None, "GRAY") or target is None or {source, target}.isdisjoint({"RGB", "BGR"}):
-        names = ", ".join(_OPENCV_SPACES.values())
-        must = f"be RGB2 or BGR2 and one of {names}, or an inverse such as HSV2RGB"
+        spaces = ", ".join(_OPENCV_SPACES.values())
+        must = f"be RGB2 or BGR2 and one of {spaces}, or an inverse such as HSV2RGB"
         raise invalid("conv or color_space", must, conv)
     if source == target:
         return image.copy()

@@ -105,7 +105,7 @@ def _read_file(source: Path, truth: Path | None = None) -> CocoFile:
         images = {image["id"]: _frame_of(image) for image in data["images"]}
         names = {entry["id"]: " ".join(str(entry["name"]).lower().split()) for entry in data["categories"]}
     except (KeyError, TypeError, AttributeError):
-        raise DatasetError(f"{source}: images and categories need an id, and categories a name") from None
+        raise DatasetError(f"{source}: every image and category needs an id, and categories a name") from None
     if {*map(type, images.values())} not in (set(), {int}, {str}):
         raise DatasetError(f"{source}: give every image a file_name, or none of them and integer ids")
     if len(set(images.values())) < len(data["images"]):
