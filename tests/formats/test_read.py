@@ -497,22 +497,3 @@ def test_an_empty_column_of_scores_is_one_of_labels(tmp_path):
     assert (labels["track_id"].tolist(), "score" in labels.columns) == ([3], False)
     with pytest.raises(DatasetError, match="line 2: some boxes have a score and some have none"):
         read_labels(written(tmp_path, f"{text}0,4,1,2,30,40,0.5\n"))
-
-
-@pytest.mark.parametrize("name", ["labels.csv", "labels.jsonl"])
-def test_classes_of_a_table(tmp_path, name):
-    rows = [(0, "Car"), (0, "person"), (1, "tram"), (2, "person")]
-    if name.endswith("csv"):
-        lines = [f"{frame},{n},0,0,50,40,{kind}\n" for n, (frame, kind) in enumerate(rows)]
-        text = "frame,track,x1,y1,x2,y2,class\n" + "".join(lines)
-    else:
-        box = {"x1": 0, "y1": 0, "x2": 50, "y2": 40}
-        lines = [{"frame": f, "track": n, **box, "class": kind} for n, (f, kind) in enumerate(rows)]
-        text = "\n".join(map(json.dumps, lines))
-    labels = read_labels(written(tmp_path, text, name))
-    assert (tuple(labels["frame"].tolist()), labels["ignore"].tolist()) == ((0, 1), [False, True])
-    assert labels.frame_keys == (0, 1, 2)
-    people = read_labels(tmp_path / name, classes=["person"])
-    assert (people["frame"].tolist(), people["ignore"].tolist()) == ([0, 1, 2], [False, True, False])
-    with pytest.raises(DatasetError, match="has no class among boat; found 'car', 'person', 'tram'"):
-        read_labels(tmp_path / name, classes=["boat"])
