@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,8 +115,13 @@ def group_windows(windows: Detections, params: RegionParams) -> Detections:
         joined = overlap_matrices(left.boxes[[best]], left.boxes)[0][0] > params.min_iou
         joined[best] = True
         # Small windows are denser. Weights proportional to the area give every size the same influence.
-        weights = (left.scores[joined] / peak) ** params.score_power * box_areas(left.boxes[joined])
-        box = _mean_box(left.boxes[joined], weights)
+        group = left.boxes[joined]
+        weights = (left.scores[joined] / peak) ** params.score_power * box_areas(group)
+        weights = weights / weights.sum()
+        # The weighted mean of centers, and that of logarithmic sizes.
+        center = weights @ ((group[:, :2] + group[:, 2:]) / 2)
+        half = np.exp(weights @ np.log(group[:, 2:] - group[:, :2])) / 2
+        box = np.concatenate([center - half, center + half])
         if left.scores[joined].sum() >= params.min_evidence:
             boxes.append(box)
             peaks.append(peak)
@@ -126,14 +130,6 @@ def group_windows(windows: Detections, params: RegionParams) -> Detections:
         middle, radius = (box[:2] + box[2:]) / 2, params.suppression_radius * (box[2:] - box[:2])
         left = left[~(joined | (np.abs(centers - middle) < radius).all(axis=1))]
     return Detections(np.array(boxes), np.array(peaks))
-
-
-def _mean_box(boxes: NDArray[Any], weights: Floats) -> Floats:
-    """Weighted mean of centers and of logarithmic sizes, as one box ``(4,)``."""
-    weights = weights / weights.sum()
-    center = weights @ ((boxes[:, :2] + boxes[:, 2:]) / 2)
-    half = np.exp(weights @ np.log(boxes[:, 2:] - boxes[:, :2])) / 2
-    return np.concatenate([center - half, center + half])
 
 
 def fit_boxes(groups: Detections, camera: Camera, shape: tuple[int, ...], params: RegionParams) -> Detections:

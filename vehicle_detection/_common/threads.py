@@ -72,18 +72,13 @@ def available_cores(root: Path = Path("/")) -> int:
 
 @functools.cache
 def _cpu_quota(root: Path) -> float:
-    """Return the lowest CPU quota of this process's control groups, in cores; 1 million without one."""
-    return min(_read_cpu_quotas(root), default=1e6)
-
-
-def _read_cpu_quotas(root: Path) -> Iterator[float]:
-    """Yield the CPU quotas of this process's Linux control groups, versions 2 and 1, in cores."""
-    groups = root / "sys/fs/cgroup"
+    """Lowest CPU quota of this process's Linux control groups, versions 2 and 1, in cores; or 1 million."""
+    groups, lowest = root / "sys/fs/cgroup", 1e6
     try:
         # Version 2: a line "0::/group"; a quota of a parent group applies too.
         own = (root / "proc/self/cgroup").read_text().rpartition("0::")[2].strip().strip("/")
     except OSError:
-        return
+        return lowest
     folders = [groups / own, *(groups / own).parents]
     files = [folder / "cpu.max" for folder in folders if folder.is_relative_to(groups)]
     for file in (*files, groups / "cpu/cpu.cfs_quota_us"):
@@ -95,7 +90,8 @@ def _read_cpu_quotas(root: Path) -> Iterator[float]:
         except (OSError, ValueError, IndexError):  # no such version, or "max": no limit
             continue
         if quota > 0 and period > 0:
-            yield quota / period
+            lowest = min(lowest, quota / period)
+    return lowest
 
 
 def resolve_jobs(jobs: int | None = None) -> int:

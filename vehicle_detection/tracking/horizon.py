@@ -100,13 +100,9 @@ class HorizonFilter:
         self._sums *= math.exp(-dt / _MEMORY_TIME - dt * misfit**2 / _MISFIT_TIME)
         weight = min(dt / _CORRELATION_TIME, 1.0) / variance[fits]
         x, y = width[fits], boxes[fits, 3]
-        self._add(
-            ids[fits], np.stack([weight, weight * x, weight * x * x, weight * y, weight * x * y], axis=1)
-        )
-        self._solve()
-
-    def _add(self, ids: NDArray[np.int64], sums: Floats) -> None:
-        """Add to the sums of these vehicles, and drop vehicles whose weight has decayed."""
+        sums = np.stack([weight, weight * x, weight * x * x, weight * y, weight * x * y], axis=1)
+        # Add to the sums of these vehicles, and drop vehicles whose weight has decayed.
+        ids = ids[fits]
         new = ids[(ids[:, None] != self._ids).all(axis=1)]
         if len(new):
             self._ids = np.concatenate((self._ids, new))
@@ -115,6 +111,7 @@ class HorizonFilter:
             self._sums[(self._ids == ids[:, None]).argmax(axis=1)] += sums
         kept = self._sums[:, 0] > _MIN_WEIGHT * self._sums[:, 0].max(initial=0.0)
         self._ids, self._sums = self._ids[kept], self._sums[kept]
+        self._solve()
 
     def _solve(self) -> None:
         """Solve for horizon and mean slope, and update `camera`."""

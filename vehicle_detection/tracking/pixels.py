@@ -65,7 +65,11 @@ class SceneCuts:
     def update(self, frame: NDArray[np.uint8]) -> bool:
         """Whether the next ``(H, W, 3)`` frame, of any size, belongs to another scene than the one before."""
         check.image(frame, "frame")
-        thumbnail = _make_thumbnail(frame)
+        height, width = self.sample_size(frame.shape)
+        sampled = cv2.resize(frame, (width, height), interpolation=cv2.INTER_NEAREST)
+        size = width // _SAMPLES, height // _SAMPLES
+        shrunk = cv2.resize(sampled, size, interpolation=cv2.INTER_AREA)
+        thumbnail: Thumbnail = np.asarray(shrunk.mean(axis=2, dtype=np.float32))
         details = thumbnail - cv2.GaussianBlur(thumbnail, (0, 0), _BLUR)
         if self._last is not None and details.std() < _MIN_DETAIL:
             return False
@@ -81,14 +85,6 @@ class SceneCuts:
             return False
         limit = min(_BASE + _SLOPE * difference, _MAX_CORRELATION)
         return _correlate_blocks(last_details, details) < limit
-
-
-def _make_thumbnail(frame: NDArray[np.uint8]) -> Thumbnail:
-    """Gray values of a frame's thumbnail, with its aspect ratio."""
-    height, width = SceneCuts.sample_size(frame.shape)
-    sampled = cv2.resize(frame, (width, height), interpolation=cv2.INTER_NEAREST)
-    shrunk = cv2.resize(sampled, (width // _SAMPLES, height // _SAMPLES), interpolation=cv2.INTER_AREA)
-    return np.asarray(shrunk.mean(axis=2, dtype=np.float32))
 
 
 def _correlate_blocks(first: Thumbnail, second: Thumbnail) -> float:
