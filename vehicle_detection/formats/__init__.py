@@ -5,12 +5,6 @@ from vehicle_detection.formats.rows import without_suffix
 from vehicle_detection.formats.write import DIGITS, open_tracks, track_records, write_labels, write_tracks
 
 __all__ = [
-    "DIGITS",
-    "FORMATS",
-    "open_tracks",
-    "read_labels",
-    "track_records",
-    "without_suffix",
-    "write_labels",
+    "DIGITS", "FORMATS", "open_tracks", "read_labels", "track_records", "without_suffix", "write_labels",
     "write_tracks",
-]
+]  # fmt: skip

@@ -49,14 +49,9 @@ from vehicle_detection.tables import (
 from vehicle_detection.tracking import UNKNOWN_LABEL
 
 FORMATS = {
-    ".csv": "csv",
-    ".jsonl": "jsonl",
-    ".ndjson": "jsonl",
-    ".parquet": "parquet",
-    ".txt": "mot",
-    ".json": "coco",
-    ".zip": "mot_zip",
-}
+    ".csv": "csv", ".jsonl": "jsonl", ".ndjson": "jsonl", ".parquet": "parquet", ".txt": "mot",
+    ".json": "coco", ".zip": "mot_zip",
+}  # fmt: skip
 """Format of each file name suffix."""
 FOLDER_FORMATS = ("kitti", "yolo")
 """Formats that are folders, which are named instead of chosen by a suffix."""

@@ -22,22 +22,7 @@ from vehicle_detection.tracking.track import (
 from vehicle_detection.tracking.tracker import Tracker
 
 __all__ = [
-    "TRACK_VALUES",
-    "UNKNOWN_LABEL",
-    "USUAL_FPS",
-    "FrameResult",
-    "HorizonEstimate",
-    "SceneCuts",
-    "Track",
-    "TrackParams",
-    "Tracker",
-    "backfill_results",
-    "estimate_horizon",
-    "interpolate_results",
-    "is_result",
-    "measure_distances",
-    "search_delay",
-    "search_interval",
-    "shown_tracks",
-    "small_gray",
-]
+    "TRACK_VALUES", "UNKNOWN_LABEL", "USUAL_FPS", "FrameResult", "HorizonEstimate", "SceneCuts", "Track",
+    "TrackParams", "Tracker", "backfill_results", "estimate_horizon", "interpolate_results", "is_result",
+    "measure_distances", "search_delay", "search_interval", "shown_tracks", "small_gray",
+]  # fmt: skip
