@@ -90,7 +90,7 @@ def _window_starts(start: int, stop: int, side: int, overlap: float, formula: st
     """First pixels of the windows along one axis."""
     step = int(side * (1 - check.number(overlap, "xy_overlap", low=0)))
     if step < 1:
-        raise invalid("xy_overlap", f"leave a step of 1 pixel or more between {side} pixels", overlap)
+        raise invalid("xy_overlap", f"leave a step of a pixel between windows of {side} pixels", overlap)
     if formula == "old":
         count = int((stop - start) / step) - 1
     else:

@@ -209,7 +209,7 @@ def _mot_rows(
             raise DatasetError(f"{where}: expected frame, id, x, y, width, height, found {len(words)} values")
         frame = parse_number(words[0], "frame (counted from 1)", where)
         if frame < 1 or frame != int(frame):
-            raise DatasetError(f"{where}: frame (counted from 1) must be at least 1, got {words[0]!r}")
+            raise DatasetError(f"{where}: frame (counted from 1) must be at least 1, got {frame:g}")
         x, y, width, height = (parse_number(word, "side of the box", where) for word in words[2:6])
         track, *values = (parse_number(word, "value", where) for word in (words[1], *words[6:]))
         x, y = x - first_pixel, y - first_pixel
