@@ -93,7 +93,9 @@ def read_model(path: str | os.PathLike[str], kind: str) -> ModelData:
     file = check.path(path)
     name = f"model file {file}"
     if not os.path.lexists(file):
-        raise ModelFileError(f"{name} does not exist; check the path, or pass {' or '.join(SHIPPED)}")
+        raise ModelFileError(
+            f"{name} does not exist; check the path, or name a shipped model: {', '.join(SHIPPED)}"
+        )
     return _parse(read_regular_file(file, name, Limit.MODEL_BYTES, error=ModelFileError), name, kind)
 
 
