@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -14,8 +15,17 @@ import pytest
 from tests.cli.commands import HEADER, contents, refuse, refuse_each, run, succeed
 from tests.helpers import failing
 from tests.video.clips import damage_sizes, write_clip
-from vehicle_detection import DrawParams, InvalidInputError, probe_video, read_frames, render_drive, video
+from vehicle_detection import (
+    DrawParams,
+    InvalidInputError,
+    TrackTable,
+    probe_video,
+    read_frames,
+    render_drive,
+    video,
+)
 from vehicle_detection.cli.demo import draw_clip
+from vehicle_detection.cli.horizon import warn_of_contradiction
 from vehicle_detection.cli.options import parse_time
 from vehicle_detection.cli.video import read_speed
 from vehicle_detection.tracking import HorizonEstimate
@@ -328,3 +338,16 @@ def test_the_copy_is_named_after_its_source_and_replaces_no_file(clip, tmp_path)
     before = contents(tmp_path)
     succeed("video", source, "--end", 0.1, "--tracks", tmp_path / "t.csv")
     assert contents(tmp_path) == sorted([*before, "t.csv"])
+
+
+def test_a_stated_horizon_that_the_sizes_of_the_vehicles_contradict_is_named(capsys):
+    height = np.repeat(np.arange(40.0, 200, 10), 25)
+    middle, bottom = np.full(len(height), 600.0), 396 + 0.9 * height  # horizon 0.55
+    boxes = np.stack([middle - height / 2, bottom - height, middle + height / 2, bottom], axis=1)
+    table = TrackTable(np.arange(len(boxes)), np.ones(len(boxes), int), boxes)
+    check = partial(warn_of_contradiction, table=table, shape=(720, 1280), fps=25, height_m=None)
+    check(0.53)
+    warn_of_contradiction(0.3, TrackTable(), (720, 1280), fps=25, height_m=None)
+    assert capsys.readouterr().err == ""
+    check(0.45)
+    assert "suggest a horizon of 0.55 (standard error 0.01) instead of 0.45" in capsys.readouterr().err

@@ -6,9 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import vehicle_detection as vd
 from vehicle_detection.cli.output import print_error, print_line
+from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from vehicle_detection.video import FrameSource
+
+# Boxes of a vehicle in a second that are used to check a stated horizon, and the difference that is accepted.
+_BOXES_PER_SECOND, _CONTRADICTION = 2, 0.05
 
 
 def search_everywhere(model: Any, conf: float | None) -> vd.Detector:
@@ -34,6 +38,24 @@ def warn_of_horizon(given: str, found: vd.tracking.HorizonEstimate | None) -> No
             f"{found.horizon:.2f}; use --horizon {found.horizon:.2f}"
         )
     print_error(f"warning: no vehicle was found with {given}{rest}")
+
+
+def warn_of_contradiction(
+    stated: float, table: vd.TrackTable, shape: tuple[int, ...], *, fps: float, height_m: float | None
+) -> None:
+    """Warn if the sizes of the tracked vehicles contradict the stated horizon."""
+    frames = table["frame"].astype(int)
+    boxes = table.boxes[frames % max(round(fps / _BOXES_PER_SECOND), 1) == 0]
+    try:
+        found = vd.tracking.estimate_horizon(boxes, shape, height_m=height_m)
+    except InvalidInputError:  # too few vehicles
+        return
+    if abs(stated - found.horizon) > _CONTRADICTION + 3 * found.horizon_std:
+        print_error(
+            f"warning: the sizes of the vehicles suggest a horizon of {found.horizon:.2f} (standard error "
+            f"{found.horizon_std:.2f}) instead of {stated:g}, with which their distances are wrong; correct "
+            "--horizon, or leave it out"
+        )
 
 
 def with_found_horizon(

@@ -236,6 +236,7 @@ def video(options: VideoOptions) -> None:
             )
         outputs.write(done, detector)
     if not options.quiet:
+        outputs.check_horizon(done, detector)
         _warn_of_camera(options, done, source, detector)
     if not options.quiet or options.profile:
         lines = str(done).splitlines()
@@ -442,6 +443,13 @@ class SideOutputs:
                 )
         camera = detector.camera.for_shape(done.shape)
         return vd.find_events(table, fps=fps, shape=done.shape, camera=camera, own_speed_mps=speeds)
+
+    def check_horizon(self, done: VideoReport, detector: vd.VehicleDetector) -> None:
+        """Warn of a stated horizon that the tracked vehicles contradict."""
+        stated = self._options.stated_horizon()
+        if stated is not None and not detector.camera.fisheye:
+            height_m, fps = self._options.camera_height, float(done.fps)
+            rows.warn_of_contradiction(stated, self._table, done.shape, fps=fps, height_m=height_m)
 
     def print_summary(self, done: VideoReport) -> None:
         """Print the counts of a drive in one line, and the number of events of each other kind in another."""
