@@ -5,6 +5,7 @@ import http.server
 import socket
 import threading
 import time
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -118,6 +119,15 @@ def test_public_addresses():
     ipv6 = ("::1", "fe80::1%eth0", "fd00::1", "::ffff:127.0.0.1")
     assert not [address for address in ipv4 + ipv6 if web._is_public(address)]
     assert not web._is_public("169.254.169.254"), "metadata of cloud machines"
+
+
+def test_a_query_needs_no_path():
+    with server(lambda _: (200, {}, b"")) as (address, paths):
+        proxy = urlsplit(web.web_proxy(address))
+        with socket.create_connection((proxy.hostname, proxy.port)) as client:
+            client.sendall(f"GET {address}?clip=1 HTTP/1.1\r\nConnection: close\r\n\r\n".encode())
+            assert b" 200 " in client.recv(100)
+    assert paths == ["/?clip=1"]
 
 
 def test_a_proxy_of_the_user_decides_itself(monkeypatch):

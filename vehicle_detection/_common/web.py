@@ -170,9 +170,8 @@ class _Connection(socketserver.BaseRequestHandler):
             if method == "CONNECT":
                 self.request.sendall(b"HTTP/1.1 200 Connected\r\n\r\n")
             else:
-                path = (
-                    target[target.index("/", target.index("://") + 3) :] if place.path else f"/{place.query}"
-                )
+                path = target.partition("://")[2][len(place.netloc) :]
+                path = path if path.startswith("/") else f"/{path}"
                 rest = head.split(b"\r\n", 1)[1]
                 server.sendall(f"{method} {path} {version}\r\n".encode("latin-1") + rest)
             _relay(self.request, server)
