@@ -202,13 +202,11 @@ class Detections:
             return NotImplemented
         if not len(self) or not len(other):  # without boxes, nothing is unknown
             return self if len(self) else other
-        pairs = {name: (getattr(self, name), getattr(other, name, None)) for name in _columns(self)}
-        return self.with_columns(
-            **{
-                name: None if first is None or second is None else np.concatenate([first, second])
-                for name, (first, second) in pairs.items()
-            }
-        )
+        joined = {}
+        for name in _columns(self):
+            first, second = getattr(self, name), getattr(other, name, None)
+            joined[name] = None if first is None or second is None else np.concatenate([first, second])
+        return self.with_columns(**joined)
 
     def __repr__(self) -> str:
         if not len(self):

@@ -164,8 +164,13 @@ class Detector(Closing):
         kind, remedy = self.model.search_params_type, "omit it for the default"
         check.instance(search_params, "search_params", kind | None, remedy)
         check.instance(region_params, "region_params", RegionParams | HeatParams | None, remedy)
-        if conf is not None:
-            region_params = self._set_confidence(conf, region_params)
+        if conf is not None:  # find boxes with this confidence
+            limit = _check_confidence(conf, region_params)
+            if isinstance(self.model, VehicleClassifier):
+                peak = self.model.calibration.score(limit)
+                region_params = cast(RegionParams, region_params or RegionParams()).with_peak(peak)
+            else:
+                self.model = cast(Any, self.model).with_confidence(limit)
         self.camera = open_camera(camera)
         self.search_params: Any = search_params or kind.default()
         if hasattr(self.search_params, "horizon"):  # bands of windows lie relative to it
@@ -182,19 +187,6 @@ class Detector(Closing):
         self._jobs = jobs
         self._search = self.model.open_search(jobs)
         self._cameras: dict[tuple[int, int], Camera] = {}
-
-    def _set_confidence(
-        self, conf: float, regions: RegionParams | HeatParams | None
-    ) -> RegionParams | HeatParams | None:
-        """Make the model find boxes with this confidence, or return region parameters that do."""
-        limit = _check_confidence(conf, regions)
-        if isinstance(self.model, VehicleClassifier):
-            return cast(RegionParams, regions or RegionParams()).with_peak(
-                self.model.calibration.score(limit)
-            )
-        model: Any = self.model
-        self.model = model.with_confidence(limit)
-        return regions
 
     def __getstate__(self) -> dict[str, Any]:
         """Return everything but the threads of the search, for copies and other processes."""

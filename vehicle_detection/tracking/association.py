@@ -67,13 +67,9 @@ def match_approaching(
     offsets, others = boxes - center, measured - center
     growth = offsets @ others.T / np.maximum(np.square(offsets).sum(axis=1), 1.0)[:, None]
     grown = center + offsets[:, None] * growth.clip(1, _MAX_GROWTH)[:, :, None]
-    iou = np.stack(
-        [
-            overlap_matrices(clip_boxes(grown[:, column], frame), measured[[column]])[0][:, 0]
-            for column in range(len(measured))
-        ],
-        axis=1,
-    )
+    clipped = (clip_boxes(grown[:, column], frame) for column in range(len(measured)))
+    columns = [overlap_matrices(each, box[None])[0] for each, box in zip(clipped, measured)]
+    iou = np.concatenate(columns, axis=1)
     return cheapest_pairs(1 - iou, (growth >= 1) & (growth <= _MAX_GROWTH) & (iou >= _MIN_GROWN_IOU))
 
 
