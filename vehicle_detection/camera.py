@@ -443,7 +443,14 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
     values = _read_values(path)
     if "camera_matrix" in values or path.suffix.lower() in _CALIBRATIONS:
         return _from_calibration(path, values)
-    _check_names(path, values)
+    known = {"image_size", "fov", "lens", "horizon", *Camera.__dataclass_fields__} - {"shape"}
+    if values.keys() - known:
+        extra = min(values.keys() - known, key=str)
+        names = ", ".join(sorted(known))
+        raise InvalidInputError(f"camera file {path} must be an object with the names {names}; got {extra}")
+    for pair in (("fov", "lens"), ("fov", "focal_px"), ("lens", "focal_px"), ("horizon", "horizon_px")):
+        if values.keys() >= {*pair}:
+            raise InvalidInputError(f"camera file {path} must hold {' or '.join(pair)}, not both; drop one")
     size = values.pop("image_size", None)
     if size is not None and (not isinstance(size, list) or len(size) != 2):
         raise InvalidInputError(f"{path}: image_size must be [width, height], got {describe(size)}")
@@ -550,18 +557,6 @@ def _distorted_radii(angles: Floats, distortion: Floats, *, fisheye: bool) -> Fl
     square = tangent**2
     above = 1 + square * (k1 + square * (k2 + square * k3))
     return np.asarray(tangent * above / (1 + square * (k4 + square * (k5 + square * k6))))
-
-
-def _check_names(path: Path, values: dict[str, Any]) -> None:
-    """Check the names in a camera file."""
-    known = {"image_size", "fov", "lens", "horizon", *Camera.__dataclass_fields__} - {"shape"}
-    if values.keys() - known:
-        extra = min(values.keys() - known, key=str)
-        names = ", ".join(sorted(known))
-        raise InvalidInputError(f"camera file {path} must be an object with the names {names}; got {extra}")
-    for pair in (("fov", "lens"), ("fov", "focal_px"), ("lens", "focal_px"), ("horizon", "horizon_px")):
-        if values.keys() >= {*pair}:
-            raise InvalidInputError(f"camera file {path} must hold {' or '.join(pair)}, not both; drop one")
 
 
 def lateral_offsets(boxes: NDArray[Any], shape: tuple[int, ...]) -> Floats:

@@ -193,7 +193,13 @@ def _detect_each(
         shown = pixels if options.blur is None else vd.blur_boxes(pixels, found.boxes, region=options.blur)
         name = Path(image.name)
         if options.why is not None:
-            _write_explanations(options.why, image.name, detector, pixels, shown, found)
+            for number, box in enumerate(found.boxes, start=1):
+                explanation = vd.explain(detector, pixels, box)
+                print_line(f"  {number}: {explanation}")
+                figure: Any = vd.notebook.plot_explanation(shown, explanation)
+                file = options.why / f"{image.name.replace('/', '_')}_{number}.png"
+                with common.atomic_write(file, "--why") as part:
+                    figure.savefig(part)
         if options.output is not None:
             # As PNG if its own format cannot be written.
             suffix = name.suffix if cv2.haveImageWriter(f"image{name.suffix}") else f"{name.suffix}.png"
@@ -262,18 +268,6 @@ def _read_each(images: list[_Image], left_out: list[_Image]) -> Iterator[tuple[_
         for message in messages:
             print_error(f"warning: {image}: {message}")
         yield image, pixels
-
-
-def _write_explanations(
-    folder: Path, name: str, detector: vd.Detector, image: Any, shown: Any, found: vd.Detections
-) -> None:
-    """Write a picture for each box of an image that says why it was found; it shows the image `shown`."""
-    for number, box in enumerate(found.boxes, start=1):
-        explanation = vd.explain(detector, image, box)
-        print_line(f"  {number}: {explanation}")
-        with common.atomic_write(folder / f"{name.replace('/', '_')}_{number}.png", "--why") as part:
-            picture: Any = vd.notebook.plot_explanation(shown, explanation)
-            picture.savefig(part)
 
 
 def _warn_if_empty(
