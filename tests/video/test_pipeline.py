@@ -385,3 +385,15 @@ def test_frames_that_are_not_searched_are_kept_only_to_be_drawn(clip, tmp_path, 
     report = process_video(clip, tmp_path / "out.mp4" if draw else None, IntervalStub(), every=1000)
     assert report.frames == 20
     assert alive == (19 if draw else 0)
+
+
+def test_a_detector_that_another_run_has_taken_over_is_an_error(clip):
+    detector = StubDetector()
+    first, second = track(clip, detector), track(clip, detector)
+    next(first)
+    assert next(second).index == 0
+    with pytest.raises(InvalidInputError, match=r"another run has begun .* pass copy.copy\(detector\)"):
+        next(first)
+    assert list(first) == []
+    assert len(list(second)) == probe_video(clip).frames - 1
+    assert len(list(track(clip, detector))) == probe_video(clip).frames

@@ -18,6 +18,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Protocol, Self
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -323,6 +324,10 @@ def _wait_for_one(running: deque[Future[Any]]) -> None:
         wait(running, timeout=0.1, return_when=FIRST_COMPLETED)  # which does not notice cancelled ones
 
 
+# The latest run of each detector, by its address: a run keeps its detector alive.
+_LATEST_RUNS: WeakValueDictionary[int, TrackRun] = WeakValueDictionary()
+
+
 class TrackRun(Closing):
     """Results of a source, frame by frame, as `track` returns it: an iterator and a context manager.
 
@@ -360,6 +365,11 @@ class TrackRun(Closing):
     def __next__(self) -> FrameResult:
         if not self._started:
             self._start()
+        elif not self._seconds and _LATEST_RUNS.get(id(self.detector)) is not self:
+            self.close()
+            raise InvalidInputError(
+                "another run has begun to track with this detector; pass copy.copy(detector) to one of them"
+            )
         try:
             result = next(self._results)
         except BaseException:
@@ -385,6 +395,7 @@ class TrackRun(Closing):
         self._bar = self._on_end.enter_context(bar)
         self._on_end.callback(self._results.close)
         self.detector.reset(fps=float(self.info.fps))
+        _LATEST_RUNS[id(self.detector)] = self
         self._started = self._logged = time.perf_counter()
         self._cpu_started = _processor_times()
 
