@@ -67,29 +67,24 @@ def test_arrays_that_fit_are_returned():
     ("image", "remedy"),
     [
         ("road.png", "read files with vehicle_detection.read_image"),
-        ([[1, 2, 3]], "pass one image after the other"),
-        (iter([IMAGE]), "pass a list of images"),
+        ([[1, 2, 3]], "pass one image after the other"), (iter([IMAGE]), "pass a list of images"),
         (SimpleNamespace(convert=None), r"numpy\.asarray\(image\.convert\('RGB'\)\)"),
         (memoryview(IMAGE), "read files with vehicle_detection.read_image"),
         (np.zeros((3, 4, 6), np.uint8), r"image\.transpose\(1, 2, 0\)"),
         (np.full((4, 6, 3), -1.0), "map its values to 0-255; they are -1 to -1"),
-        (None, "read files with vehicle_detection.read_image"),
-        (IMAGE[..., 0], "COLOR_GRAY2RGB"),
-        (IMAGE[..., :1], "COLOR_GRAY2RGB"),
-        (np.zeros((4, 6, 4), np.uint8), "drop the alpha channel"),
+        (None, "read files with vehicle_detection.read_image"), (IMAGE[..., 0], "COLOR_GRAY2RGB"),
+        (IMAGE[..., :1], "COLOR_GRAY2RGB"), (np.zeros((4, 6, 4), np.uint8), "drop the alpha channel"),
         (np.zeros((2, 4, 6, 3), np.uint8), "pass one image"),
         (np.zeros((4, 6, 2), np.uint8), "three color channels"),
         (np.zeros(3, np.uint8), "three color channels"),
         (np.zeros((0, 6, 3), np.uint8), "the image is empty"),
-        (np.zeros((4, 0, 3), np.uint8), "the image is empty"),
-        (IMAGE / 255, r"\(image \* 255\)"),
+        (np.zeros((4, 0, 3), np.uint8), "the image is empty"), (IMAGE / 255, r"\(image \* 255\)"),
         (IMAGE.astype(np.float32), r"\(image \* 255\)"),
         (IMAGE + 255.0, r"convert its values 0-255 with image.round\(\).astype\(numpy.uint8\)"),
-        (IMAGE.astype(np.uint16), "image // 257"),
-        (IMAGE.astype(np.int64), "0-255"),
+        (IMAGE.astype(np.uint16), "image // 257"), (IMAGE.astype(np.int64), "0-255"),
         (IMAGE.astype(bool), "0-255"),
     ],
-)
+)  # fmt: skip
 def test_check_image_explains_the_conversion(image, remedy):
     with pytest.raises(InvalidInputError, match=rf"^frame must be an \(H, W, 3\) uint8 RGB array.*{remedy}"):
         check.image(image, "frame")
@@ -138,21 +133,19 @@ def test_check_boxes_accepts_corner_pairs_and_detections():
 @pytest.mark.parametrize(
     ("boxes", "message"),
     [
-        ([0, 1, 2, 3], "wrap a single box in a list"),
-        ([[0, 1, 2]], r"an \(N, 4\) number array"),
+        ([0, 1, 2, 3], "wrap a single box in a list"), ([[0, 1, 2]], r"an \(N, 4\) number array"),
         ([[[0, 1, 2, 3]]], r"an \(N, 4\) number array"),
         ([["a", "b", "c", "d"]], r"an \(N, 4\) number array"),
         ([[True, True, True, True]], r"an \(N, 4\) number array"),
         ([[0, 0, 1, 1], [0, 0, 1]], "numbers of equal lengths"),
         ((SimpleNamespace(box=[0, 0, 1, 1]),), r"pass \[track.box for track in tracks\]"),
         (pandas.DataFrame([[0, 0, 1, 1]], dtype="Int64"), r"convert .* with table.astype\(float\)"),
-        (None, r"an \(N, 4\) number array"),
-        ([[0, 0, math.nan, 1]], "must be finite"),
+        (None, r"an \(N, 4\) number array"), ([[0, 0, math.nan, 1]], "must be finite"),
         ([[0, 0, math.inf, 1]], "must be finite"),
         ([[0, 0, 1, 1], [10, 10, 5, 20]], r"\[1\] must be .*, got \[10, 10, 5, 20\] .* x \+ width"),
         (np.array([[10, 10, 5, 20]], np.uint8), r"\[0\] must be"),
     ],
-)
+)  # fmt: skip
 def test_check_boxes_refuses(boxes, message):
     with pytest.raises(InvalidInputError, match=f"^windows.*{message}"):
         check.boxes(boxes, "windows")

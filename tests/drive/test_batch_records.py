@@ -13,18 +13,12 @@ from vehicle_detection.errors import OutputError
 
 GOOD = {"status": "done", "sources": [{"uri": "a"}]}
 ODD_RECORDS = [
-    {"status": "done", "sources": [1]},
-    {"status": ["x"], "sources": [{"uri": "a"}]},
-    {"status": "failed", "sources": {"a": 1}},
-    GOOD | {"frames": "x"},
-    GOOD | {"frames": 1e200},
-    GOOD | {"seconds": -1},
-    GOOD | {"status": "failed", "message": {"a": 1}},
-    GOOD | {"date": 3},
+    {"status": "done", "sources": [1]}, {"status": ["x"], "sources": [{"uri": "a"}]},
+    {"status": "failed", "sources": {"a": 1}}, GOOD | {"frames": "x"}, GOOD | {"frames": 1e200},
+    GOOD | {"seconds": -1}, GOOD | {"status": "failed", "message": {"a": 1}}, GOOD | {"date": 3},
     GOOD | {"outputs": {"tracks": "../victim"}},
-    GOOD | {"outputs": {"tracks": "tracks/date=a/camera=b/c.parquet"}},
-    [],
-]
+    GOOD | {"outputs": {"tracks": "tracks/date=a/camera=b/c.parquet"}}, [],
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("record", ODD_RECORDS, ids=json.dumps)

@@ -10,17 +10,10 @@ from vehicle_detection.training.tuning import COLUMNS
 
 def example_row(number):
     return {
-        **dict.fromkeys(COLUMNS),
-        "status": "ok",
-        "message": 'a "quoted", text; ä',
-        "configuration": "007",
-        "hog_channel": ["ALL", 0][number % 2],
-        "mirror": True,
-        "C": 1e-4 / (number + 1),
-        "accuracy": 1 / (number + 3),
-        "seed": number,
-        "trial": f"{number:04d}e{number}",
-    }
+        **dict.fromkeys(COLUMNS), "status": "ok", "message": 'a "quoted", text; ä', "configuration": "007",
+        "hog_channel": ["ALL", 0][number % 2], "mirror": True, "C": 1e-4 / (number + 1),
+        "accuracy": 1 / (number + 3), "seed": number, "trial": f"{number:04d}e{number}",
+    }  # fmt: skip
 
 
 def example_table(count):
