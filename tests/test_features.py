@@ -154,18 +154,12 @@ def test_all_kinds_of_sources_give_the_same_features(tmp_path):
     for path, patch in zip(paths, patches):
         write_image(path, patch)
     sources = {
-        "list": list(patches),
-        "tuple": tuple(patches),
-        "views": [patch[::-1][::-1] for patch in patches],
-        "generator": (patch for patch in patches),
-        "paths": paths,
-        "strings": map(str, paths),
-        "array of paths": np.array(paths),
-        "array of strings": np.array([str(path) for path in paths]),
-        "mixed": [paths[0], *patches[1:]],
-        "strided": np.repeat(patches, 2, axis=0)[::2],
+        "list": list(patches), "tuple": tuple(patches), "views": [patch[::-1][::-1] for patch in patches],
+        "generator": (patch for patch in patches), "paths": paths, "strings": map(str, paths),
+        "array of paths": np.array(paths), "array of strings": np.array([str(path) for path in paths]),
+        "mixed": [paths[0], *patches[1:]], "strided": np.repeat(patches, 2, axis=0)[::2],
         "reversed": np.ascontiguousarray(patches[:, :, ::-1])[:, :, ::-1],
-    }
+    }  # fmt: skip
     for name, source in sources.items():
         np.testing.assert_array_equal(extract_features(source), expected, err_msg=name)
 
