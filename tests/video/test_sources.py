@@ -171,6 +171,7 @@ def test_images_in_natural_order(tmp_path):
     [
         ([], "at least one file"),
         ([np.zeros((32, 32, 3), np.uint8)], r"call detector.process\(frame, time\) with frames"),
+        ("", "source must be a file, a folder, a pattern or a URL, got an empty name"),
         ("empty", "source empty holds no videos and no images"),
         ("*.mp4", r"source \*\.mp4 holds no videos"),
         ("-", "standard input, which is not a pipe"),

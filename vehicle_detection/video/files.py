@@ -54,6 +54,8 @@ def list_files(source: str | os.PathLike[str]) -> list[Path]:
     """
     text = os.fsdecode(source)
     path = check.path(text, "source", kind="the path of a video file")
+    if not text.strip():  # it would be the current folder
+        raise InvalidInputError("source must be a file, a folder, a pattern or a URL, got an empty name")
     if is_url(text):
         return []
     if path.is_dir():

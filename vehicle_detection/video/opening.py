@@ -198,7 +198,7 @@ def _open(source: object, options: _Options) -> FrameSource:
         return _open_camera(text, options)
     if path.is_fifo():
         return Stream(options.open_stream(text, input_options(path)), live=bool(options.live))
-    files = list_files(path) or [check_file(path)]
+    files = list_files(text) or [check_file(path)]
     if len(files) > 1 and is_video_file(files[0]):
         raise InvalidInputError(
             f"source {path} holds {len(files)} videos; open the segments of one trip with open_trip, or pass "
