@@ -16,11 +16,17 @@ from vehicle_detection.drive.motion import TrackHistory, bin_means, track_histor
 PRESENCE = st.lists(st.sets(st.integers(1, 4)), max_size=40)
 
 
-@given(PRESENCE)
-def test_histories_have_the_frames_and_values_of_each_track(frames):
+def table_of(frames):
+    """Table of the ids of the tracks in each frame."""
     table = TrackTable()
     for index, numbers in enumerate(frames):
         table.append(index, None, [track(number, distance=index + number) for number in sorted(numbers)])
+    return table
+
+
+@given(PRESENCE)
+def test_histories_have_the_frames_and_values_of_each_track(frames):
+    table = table_of(frames)
     histories = track_histories(table)
     assert {each.id for each in histories} == set().union(*frames)
     for each in histories:
