@@ -72,6 +72,13 @@ class TrainingReport:
     `seconds`: work time per step; concurrent fits are summed, so the total may exceed the elapsed time.
     `calibration_error`: on the test part of ``"sequences"``, with the sigmoid fitted on a second such split
     of the training part; None if that split is impossible.
+
+    >>> from vehicle_detection import render_patches
+    >>> patches, labels = render_patches(20)
+    >>> names = [f"{'vehicles' if label else 'others'}/drawn/{n}.png" for n, label in enumerate(labels)]
+    >>> _, report = train_and_evaluate(PatchSet(patches, labels, names), params=FeatureParams(hog_channel=0))
+    >>> report.split, report.vehicles, report.sources
+    ('random', 10, {'drawn': 20})
     """
 
     params: FeatureParams
@@ -166,20 +173,12 @@ def train_and_evaluate(
     with ThreadPoolExecutor(resolve_jobs(jobs)) as pool, shown as bar:
         features, spent = _timed(lambda: patch_features(patch_set.patches, params, options, jobs=jobs))
         seconds = defaultdict(float, features=spent)
-
-        def fit(part: Split | None) -> Any:
-            """Train on all patches; or on a part of them, and return the scores of the others."""
-            rows = None if part is None else part.train
-            trained = fit_features(features, labels, params, options, rows=rows)
-            return trained if part is None else trained.decision_function(features[part.test])
-
+        fit = partial(_fit, features, labels, params, options)
         running = [pool.submit(_timed, partial(fit, part)) for _, part in fits]
         for future in running:
             future.add_done_callback(lambda _: bar.update())
         try:
-            leakage, seconds["leakage"] = _timed(
-                lambda: {name: split_leakage(patch_set, listed[0]) for name, listed in splits.items()}
-            )
+            leakage, seconds["leakage"] = _timed(partial(_find_leakage, patch_set, splits))
             for (name, _), future in zip(fits, running):
                 result, spent = future.result()
                 found[name].append(result)
@@ -208,6 +207,24 @@ def train_and_evaluate(
     )
     metadata = {**classifier.metadata, **_report_metadata(report)}
     return dataclasses.replace(classifier, metadata=metadata), report
+
+
+def _fit(
+    features: NDArray[np.float32],
+    labels: NDArray[np.int64],
+    params: FeatureParams,
+    options: TrainingOptions,
+    part: Split | None,
+) -> Any:
+    """Train on all patches; or on a part of them, and return the scores of the others."""
+    rows = None if part is None else part.train
+    trained = fit_features(features, labels, params, options, rows=rows)
+    return trained if part is None else trained.decision_function(features[part.test])
+
+
+def _find_leakage(patch_set: PatchSet, splits: dict[str, list[Split]]) -> dict[str, float]:
+    """`split_leakage` of the first split of each kind."""
+    return {name: split_leakage(patch_set, parts[0]) for name, parts in splits.items()}
 
 
 def _make_splits(
