@@ -76,8 +76,9 @@ def hog_cells(image: NDArray[Any], orient: int, cell: int, transform_sqrt: bool)
     return cells
 
 
-# Values of a row that are processed together: the rows of their gradients and sums stay in the first cache.
-_TILE = 312
+# Values of a row that are processed together: a multiple of 64, which vectors divide without rest. The rows
+# of their gradients and sums stay in the first cache.
+_TILE = 384
 
 
 def _sum_magnitudes(image: NDArray[Any], cell: int, cells: NDArray[np.float32]) -> None:
@@ -380,25 +381,36 @@ def add_correlation(
     if missing := -len(channels) % 4:
         channels = np.concatenate([channels, np.zeros((missing, *channels.shape[1:]), np.float32)])
         weights = np.pad(weights, ((0, 0), (0, 0), (0, missing)))
-    correlate(channels, weights, dilation, scores)
+    (height, width), columns = scores.shape, channels.shape[2]
+    if not scores.size:
+        return
+    # Positions count through all rows; windows across the ends of rows are not used.
+    sums = np.zeros((height, columns), np.float32)
+    used = sums.reshape(-1)[: (height - 1) * columns + width]
+    correlate(channels.reshape(len(channels), -1), weights, columns, dilation, used)
+    scores += sums[:, :width]
+
+
+# Positions that are summed together: their sums and the values of four channels stay in the first cache.
+_POSITIONS = 1024
 
 
 @functools.partial(jit, reorder=True)
-def correlate(channels, weights, dilation, scores):
+def correlate(channels, weights, columns, dilation, sums):
     """Add the correlation of a number of channels that is a multiple of 4; see `add_correlation`.
 
-    Four channels are added at a time, so that a score is loaded and stored once for four products, and all
-    columns of the weights before the next channels, which stay in the cache.
+    `channels` is ``(channels, cells)``, with rows of `columns` cells one after the other, and `sums` has a
+    value for each cell at which a window starts. Four channels are added at a time, so that a sum is loaded
+    and stored once for four products.
     """
-    for y in range(scores.shape[0]):
-        out = scores[y]
-        for row in range(weights.shape[0]):
-            line = y + row * dilation
-            for k in range(0, channels.shape[0], 4):
+    for start in range(0, len(sums), _POSITIONS):
+        out = sums[start : start + _POSITIONS]
+        for k in range(0, channels.shape[0], 4):
+            for row in range(weights.shape[0]):
                 for column in range(weights.shape[1]):
-                    x, w = column * dilation, weights[row, column, k:]
+                    cell, w = start + (row * columns + column) * dilation, weights[row, column, k:]
                     w0, w1, w2, w3 = w[0], w[1], w[2], w[3]
-                    v0, v1 = channels[k, line, x:], channels[k + 1, line, x:]
-                    v2, v3 = channels[k + 2, line, x:], channels[k + 3, line, x:]
-                    for i in range(out.shape[0]):
+                    v0, v1 = channels[k, cell:], channels[k + 1, cell:]
+                    v2, v3 = channels[k + 2, cell:], channels[k + 3, cell:]
+                    for i in range(len(out)):
                         out[i] += (w0 * v0[i] + w1 * v1[i]) + (w2 * v2[i] + w3 * v3[i])
