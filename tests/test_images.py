@@ -163,6 +163,14 @@ def test_the_limit_of_pixels_is_adjustable(picture, monkeypatch):
             decode_image(data, "a.png")
 
 
+@pytest.mark.parametrize("suffix", [".png", ".webp"])
+def test_an_animated_image_is_one_picture_with_a_warning(tmp_path, suffix, caplog):
+    first, second = (Image.new("RGB", (40, 30), color) for color in ("red", "blue"))
+    first.save(tmp_path / f"a{suffix}", save_all=True, append_images=[second], duration=100, lossless=True)
+    assert (read_image(tmp_path / f"a{suffix}") == (255, 0, 0)).all()
+    assert "animated" in caplog.text
+
+
 SUFFIXES = [".png", ".jpg", ".bmp", ".tiff", ".webp", ".gif", ".ppm", ".pgm", ".pbm", ".jp2"]
 
 

@@ -6,6 +6,7 @@ import contextlib
 import glob
 import importlib
 import io
+import logging
 import os
 import re
 import struct
@@ -31,6 +32,8 @@ from vehicle_detection._common import (
     read_regular_file,
 )
 from vehicle_detection.errors import InvalidInputError
+
+_LOGGER = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif")
 """Suffixes of the images that a folder is searched for."""
@@ -115,6 +118,8 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
         reasons = (reason for magic, reason in _NOT_READ.items() if re.match(magic, data, re.DOTALL))
         reason = next(reasons, "it cannot be decoded")
         raise InvalidInputError(f"{name} must be a complete image file (PNG, JPEG, ...); {reason}")
+    if _is_animated(data):
+        _LOGGER.warning("%s is animated, its first picture is read; as a GIF or MP4 it is a video", name)
     return np.asarray(image, np.uint8)
 
 
@@ -146,6 +151,13 @@ def _is_truncated(data: bytes) -> bool:
         # The end marker must follow the last scan; an earlier one belongs to a thumbnail in the header.
         return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
     return data.startswith(b"\x89PNG") and b"IEND" not in data
+
+
+def _is_animated(data: bytes) -> bool:
+    """Whether a PNG or WebP file shows several pictures, one after the other."""
+    if data.startswith(b"\x89PNG"):
+        return b"acTL" in data.partition(b"IDAT")[0]
+    return data[12:16] == b"VP8X" and bool(data[20] & 2)
 
 
 def read_image(path: str | os.PathLike[str] | bytes) -> NDArray[np.uint8]:
