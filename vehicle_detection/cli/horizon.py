@@ -53,8 +53,8 @@ def warn_of_contradiction(
     if abs(stated - found.horizon) > _CONTRADICTION + 3 * found.horizon_std:
         print_error(
             f"warning: the sizes of the vehicles suggest a horizon of {found.horizon:.2f} (standard error "
-            f"{found.horizon_std:.2f}) instead of {stated:g}, with which their distances are wrong; correct "
-            "--horizon, or leave it out"
+            f"{found.horizon_std:.2f}) instead of {stated:.3g}, with which their distances are wrong; "
+            "correct it, or leave it out"
         )
 
 

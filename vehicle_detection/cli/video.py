@@ -445,11 +445,11 @@ class SideOutputs:
         return vd.find_events(table, fps=fps, shape=done.shape, camera=camera, own_speed_mps=speeds)
 
     def check_horizon(self, done: VideoReport, detector: vd.VehicleDetector) -> None:
-        """Warn of a stated horizon that the tracked vehicles contradict."""
-        stated = self._options.stated_horizon()
-        if stated is not None and not detector.camera.fisheye:
-            height_m, fps = self._options.camera_height, float(done.fps)
-            rows.warn_of_contradiction(stated, self._table, done.shape, fps=fps, height_m=height_m)
+        """Warn of a horizon, stated by the option or a camera's file, that the tracks contradict."""
+        camera, options = detector.camera, self._options
+        if camera.horizon_is_known and not camera.fisheye and options.horizon != "auto":
+            fps, height_m = float(done.fps), options.camera_height
+            rows.warn_of_contradiction(camera.horizon, self._table, done.shape, fps=fps, height_m=height_m)
 
     def print_summary(self, done: VideoReport) -> None:
         """Print the counts of a drive in one line, and the number of events of each other kind in another."""
