@@ -27,7 +27,6 @@ log = logging.getLogger(__name__)
 _LAST_RATE = 0.02  # as a fraction of the highest
 _WEIGHT_DECAY = 0.05  # of kernels
 _MAX_GRADIENT = 5.0  # norm
-_DECAY = 0.9995  # of the moving average of the weights, at most
 _CHECKPOINT_SECONDS, _REPORT_SECONDS = 30.0, 10.0
 
 
@@ -144,7 +143,7 @@ class _State:
         nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT)
         self.optimizer.step()
         self.step += 1
-        decay = min(_DECAY, (1 + self.step) / (20 + self.step))
+        decay = (1 + self.step) / (20 + self.step)  # the average covers the last twentieth of the steps
         means, values = (list(each.state_dict().values()) for each in (self.average, self.network))
         floats = [row for row, mean in enumerate(means) if mean.dtype.is_floating_point]
         torch._foreach_lerp_([means[i] for i in floats], [values[i] for i in floats], 1 - decay)
