@@ -35,7 +35,10 @@ from vehicle_detection.errors import InvalidInputError
 
 _LOGGER = logging.getLogger(__name__)
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif")
+IMAGE_SUFFIXES = (
+    ".jpg", ".jpeg", ".jfif", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif", ".jp2", ".ppm",
+    ".pgm",
+)  # fmt: skip
 """Suffixes of the images that a folder is searched for."""
 
 # What a format's files begin with, and the class of Pillow that reads their header.
@@ -46,6 +49,11 @@ _HEADERS = {
     rb"P[1-6][\s#]": "PpmImagePlugin.PpmImageFile",
     rb"\0\0\0\x0cjP  |\xff\x4f\xff\x51": "Jpeg2KImagePlugin.Jpeg2KImageFile",
 }
+_TIFF = re.compile(rb"II[*+]\0|MM\0[*+]")
+# What begins a segment of a JPEG, or ends it: not the bytes and restarts that occur inside compressed data.
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
+# Largest 8-bit value of a file whose 16 bits hold 14 or fewer.
+_DARK = 64
 # Why a file is no image, by how it begins.
 _NOT_READ = {
     rb"\Z": "it is empty",
@@ -68,20 +76,26 @@ def image_size(data: bytes) -> tuple[int, int] | None:
         if size := _jpeg_size(data):
             return size
         file = io.BytesIO(data)
-        if re.match(rb"II[*+]\0|MM\0[*+]", data):  # the tags only: Pillow knows fewer kinds of pixels
-            tiff = importlib.import_module("PIL.TiffImagePlugin")
-            tags = tiff.ImageFileDirectory_v2(data[: 16 if b"+" in data[2:4] else 8])
-            file.seek(tags.next)
-            tags.load(file)
+        if _TIFF.match(data):  # the tags only: Pillow knows fewer kinds of pixels
+            tags = _tiff_tags(data)
             return int(tags[256]), int(tags[257])
         for magic, reader in _HEADERS.items():
             if re.match(magic, data, re.DOTALL):
                 module, name = reader.split(".")
                 width, height = getattr(importlib.import_module(f"PIL.{module}"), name)(file).size
                 return int(width), int(height)
-    except Exception:  # Pillow's plugins raise anything for a damaged header
+    except Exception:  # Pillow's plugins raise anything for a damaged file
         return None
     return None
+
+
+def _tiff_tags(data: bytes) -> Any:
+    """Tags of the first picture in a TIFF file, and as ``next`` where those of the second one begin, or 0."""
+    tiff, file = importlib.import_module("PIL.TiffImagePlugin"), io.BytesIO(data)
+    tags = tiff.ImageFileDirectory_v2(data[: 16 if b"+" in data[2:4] else 8])
+    file.seek(tags.next)
+    tags.load(file)
+    return tags
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
@@ -118,8 +132,16 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
         reasons = (reason for magic, reason in _NOT_READ.items() if re.match(magic, data, re.DOTALL))
         reason = next(reasons, "it cannot be decoded")
         raise InvalidInputError(f"{name} must be a complete image file (PNG, JPEG, ...); {reason}")
-    if _is_animated(data):
-        _LOGGER.warning("%s is animated, its first picture is read; as a GIF or MP4 it is a video", name)
+    if _has_several(data):
+        _LOGGER.warning(
+            "%s holds several pictures, of which the first is read; track reads all of a GIF or MP4", name
+        )
+    if _is_deep(data) and image.max() <= _DARK:
+        _LOGGER.warning(
+            "%s is nearly black: its values use few of their 16 bits, such as the lower 12 or 14; scale them "
+            "to 0-65535",
+            name,
+        )
     return np.asarray(image, np.uint8)
 
 
@@ -147,17 +169,34 @@ def _decode_heif(data: bytes, name: str) -> NDArray[np.uint8]:
 
 def _is_truncated(data: bytes) -> bool:
     """Whether a JPEG or PNG lacks its end; OpenCV fills the missing part with gray without an error."""
-    if data.startswith(b"\xff\xd8"):
-        # The end marker must follow the last scan; an earlier one belongs to a thumbnail in the header.
-        return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
-    return data.startswith(b"\x89PNG") and b"IEND" not in data
+    if not data.startswith(b"\xff\xd8"):
+        return data.startswith(b"\x89PNG") and b"IEND" not in data
+    # From segment to segment: a thumbnail in one of them has an end marker, too, and phones append a video.
+    marker = _JPEG_MARKER.search(data, 2)
+    while marker and marker[0] != b"\xff\xd9":
+        length = int.from_bytes(data[marker.end() : marker.end() + 2], "big")
+        marker = _JPEG_MARKER.search(data, marker.end() + length)
+    return marker is None
 
 
-def _is_animated(data: bytes) -> bool:
-    """Whether a PNG or WebP file shows several pictures, one after the other."""
+def _has_several(data: bytes) -> bool:
+    """Whether a PNG, WebP or GIF file is animated, or a TIFF file has pages."""
     if data.startswith(b"\x89PNG"):
         return b"acTL" in data.partition(b"IDAT")[0]
+    if data.startswith(b"GIF"):
+        with contextlib.suppress(Exception):  # Pillow's plugins raise anything for a damaged file
+            gif = importlib.import_module("PIL.GifImagePlugin")
+            return bool(gif.GifImageFile(io.BytesIO(data)).is_animated)
+    if _TIFF.match(data):
+        return bool(_tiff_tags(data).next)
     return data[12:16] == b"VP8X" and bool(data[20] & 2)
+
+
+def _is_deep(data: bytes) -> bool:
+    """Whether a PNG or TIFF file has 16 bits for each value."""
+    if _TIFF.match(data):
+        return max(np.atleast_1d(_tiff_tags(data).get(258, 1))) == 16
+    return data.startswith(b"\x89PNG") and data[24] == 16
 
 
 def read_image(path: str | os.PathLike[str] | bytes) -> NDArray[np.uint8]:

@@ -94,15 +94,17 @@ def test_patterns_of_images_are_expanded_and_each_image_searched_once(picture, t
 
 
 def test_folders_are_searched_and_distances_stated_with_a_lens(picture, tmp_path):
+    image = road((14, 0), (34, 3.6), shape=(360, 640), random_state=3).image
     for name in ("a/1.png", "b/1.png"):
         (tmp_path / "in" / name).parent.mkdir(parents=True, exist_ok=True)
-        write_image(tmp_path / "in" / name, road((14, 0), (34, 3.6), shape=(360, 640), random_state=3).image)
+        write_image(tmp_path / "in" / name, image)
+    (tmp_path / "in/b/1.png").rename(tmp_path / "in/b/1.jfif")  # as browsers name JPEG files
     words = "--fov", 58, "-o", tmp_path / "out", "--boxes", tmp_path / "boxes.csv"
     out = succeed("detect", tmp_path / "in", *words)
     assert len(re.findall(r"\d% \d+ ± \d+ m", out)) == 4
-    assert contents(tmp_path / "out") == ["a", "a/1.png", "b", "b/1.png"]
+    assert contents(tmp_path / "out") == ["a", "a/1.png", "b", "b/1.jfif.png"]
     table = read_labels(tmp_path / "boxes.csv")
-    assert table.frame_keys == ("a/1.png", "b/1.png")
+    assert table.frame_keys == ("a/1.png", "b/1.jfif")
     assert (np.abs(table["distance_m"] - [14, 34] * 2) < 2 * table["distance_std_m"]).all()
 
 

@@ -62,7 +62,7 @@ def parent_folder(name: str) -> str:
 
 def is_image(name: str) -> bool:
     """Whether a file name is that of an image that is not hidden."""
-    return name.lower().endswith((*IMAGE_SUFFIXES, ".ppm")) and not is_hidden(name)
+    return name.lower().endswith(IMAGE_SUFFIXES) and not is_hidden(name)
 
 
 def open_archive(path: Path, shown: str | None = None) -> zipfile.ZipFile:

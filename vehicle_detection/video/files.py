@@ -24,6 +24,7 @@ from vehicle_detection._common import (
     without_query,
 )
 from vehicle_detection.errors import InvalidInputError, TransientVideoError
+from vehicle_detection.images import IMAGE_SUFFIXES
 
 Result = TypeVar("Result")
 
@@ -31,8 +32,6 @@ VIDEO_SUFFIXES = {
     ".mp4", ".m4v", ".mov", ".mkv", ".avi", ".webm", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp",
 }  # fmt: skip
 """Suffixes of the videos that a folder is searched for."""
-IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
-"""Suffixes of the images that a folder is searched for."""
 
 # Seconds before the second and the third attempt of a request.
 _RETRY_DELAYS = (0.2, 1.0)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from vehicle_detection._common import NETWORK_TIMEOUT, check, describe, local_path, temporary_folder
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.images import IMAGE_SUFFIXES
 from vehicle_detection.tracking import USUAL_FPS
 from vehicle_detection.video.ffmpeg import (
     input_options,
@@ -22,7 +23,7 @@ from vehicle_detection.video.ffmpeg import (
     restrict_input,
     source_name,
 )
-from vehicle_detection.video.files import IMAGE_SUFFIXES, check_file, download, is_video_file, list_files
+from vehicle_detection.video.files import check_file, download, is_video_file, list_files
 from vehicle_detection.video.live import LiveStream
 from vehicle_detection.video.probe import VideoInfo, probe
 from vehicle_detection.video.reading import FrameReader, check_span, frame_range

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import Closing, temporary_folder
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
-from vehicle_detection.images import read_image
+from vehicle_detection.images import IMAGE_SUFFIXES, read_image
 from vehicle_detection.tracking import USUAL_FPS
 from vehicle_detection.video.ffmpeg import input_options, restrict_input, source_name
-from vehicle_detection.video.files import IMAGE_SUFFIXES
 from vehicle_detection.video.live import LiveStream
 from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.reading import AudioSource, FrameReader, Reader, stream_duration
