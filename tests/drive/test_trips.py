@@ -26,10 +26,10 @@ def summary(names, seconds=60.0):
     [
         ("20260131_081500_F.MP4", "front"),
         ("20260131_081500_PR.mp4", "rear"),
-        ("2026-01-31_08-15-00-front.mp4", "front"),
+        ("2026-01-31T08:15:00Z_front.mp4", "front"),
+        ("260131_081500.mov", "unknown"),
         ("20260131081500_000001A.MP4", "unknown"),
         ("DCIM/Movie_Rear/20260131_081500.mp4", "rear"),
-        ("20260131_081500.mp4", "unknown"),
     ],
 )
 def test_the_camera_and_the_time_of_a_name(name, camera):
@@ -139,13 +139,13 @@ def test_numbers_with_modification_times(tmp_path, caplog, ends, trips, warned):
 MAKERS = {
     "{0:%Y%m%d_%H%M%S}_NF.mp4": "front",  # BlackVue
     "{0:%Y%m%d_%H%M%S}_EI.mp4": "interior",
-    "{0:%Y%m%d_%H%M%S}_NR.mp4": "rear",
     "{0:%Y%m%d_%H%M%S}_NFS.mp4": "front",
     "{0:%Y_%m%d_%H%M%S}_{1:06}F.MP4": "front",  # Viofo
     "{0:%Y_%m%d_%H%M%S}_{1:06}PI.MP4": "interior",
     "NO{0:%Y%m%d-%H%M%S}-{1:06}B.MP4": "rear",  # 70mai
     "{0:%y%m%d_%H%M%S}_{1:03}_FH.MP4": "front",  # Nextbase
     "{0:%y%m%d_%H%M%S}_{1:03}_CL_RADR.MP4": "interior",
+    "FILE{0:%y%m%d-%H%M%S}R.MP4": "rear",  # Mio
     "GRMN{1:04}.MP4": "unknown",  # Garmin
     "REC_{0:%Y_%m_%d_%H_%M_%S}_R.MP4": "rear",  # Thinkware
     "{0:%Y%m%d_%H%M%S}_{1:05}_N_A.MP4": "front",  # Vantrue

@@ -48,10 +48,12 @@ _MAX_SEGMENT = 660.0
 _FIRST_YEAR = 2009
 
 _TIME = re.compile(
-    r"(?<!\d)(20\d{2})[-_.]?(\d{2})[-_.]?(\d{2})[-_. T]{0,3}(\d{2})[-_.h]?(\d{2})[-_.m]?(\d{2})(?!\d{6})"
+    r"(?<!\d)(20\d{2})[-_.]?(\d{2})[-_.]?(\d{2})[-_. T]{0,3}(\d{2})[-_.:h]?(\d{2})[-_.:m]?(\d{2})(?!\d{6})"
 )
-# Nextbase, whose years have two digits: 260131_081500_001_FH.MP4.
-_SHORT_TIME = re.compile(r"^(\d{2})(\d{2})(\d{2})_(\d{2})(\d{2})(\d{2})(?=_\d{3}_[A-Z]{2}(?:_|$))", re.I)
+# Years of two digits: 260131_081500_001_FH.MP4 (Nextbase), FILE260131-081500F.MP4 (Mio).
+_SHORT_TIME = re.compile(
+    r"^[A-Za-z]*(\d{2})(0[1-9]|1[0-2])([0-3]\d)[-_]([01]\d|2[0-3])([0-5]\d)([0-5]\d)(?!\d)"
+)
 # A number that counts the files of a camera, perhaps with a letter or two for the kind of recording.
 _COUNTER = re.compile(r"(?<!\d)\d{3,}(?=[A-Za-z]{0,2}(?![A-Za-z0-9]))")
 # Chapters of one recording of a GoPro: GH010042, GH020042; up to HERO5 GOPR0042, GP010042. GL: low
