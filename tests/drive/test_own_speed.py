@@ -190,10 +190,10 @@ class TestGpx:
             read_own_speed(path)
 
 
-def sentence(second, knots, status="A", south="N"):
-    text = (
-        f"GNRMC,08150{second}.500,{status},5000.{second * 10:04},{south},01000.0000,W,{knots},84.4,310126,,,A"
-    )
+def sentence(second, knots, status="A", *, date="310126", clock=True):
+    place = f"5000.{second * 10:04},N,01000.0000,W" if date and clock else ",,,"
+    time = f"08150{second}.500" if clock else ""
+    text = f"GNRMC,{time},{status},{place},{knots},84.4,{date},,,A"
     check = functools.reduce(lambda bits, letter: bits ^ ord(letter), text, 0)
     return f"[1769847300123]${text}*{check:02X}\r\n$GPGSV,3,1,11*4A\r\n"
 
@@ -207,20 +207,19 @@ class TestNmea:
         np.testing.assert_allclose(found.at([0, 2.5, 4]), 10, rtol=1e-6)
         assert np.isnan(found.at([4.1]))
 
-    @pytest.mark.parametrize("date", ["310126", "060180"])
-    def test_the_record_starts_before_the_first_position(self, tmp_path, caplog, date):
-        """Unless the clock of the receiver is wrong until then."""
+    @pytest.mark.parametrize(("date", "clock"), [("310126", True), ("060180", True), ("", True), ("", False)])
+    def test_the_record_starts_before_the_first_position(self, tmp_path, caplog, date, clock):
+        """Also if the clock of the receiver is wrong or not set until then."""
         path = tmp_path / "a.nmea"
-        void = "".join(sentence(second, "", "V").replace("310126", date) for second in range(3))
-        path.write_text(void + "".join(sentence(second, 36 / 1.852) for second in range(3, 9)))
-        start = 3 if date == "310126" else 0
+        void = [sentence(second, "", "V", date=date, clock=clock) for second in range(3)]
+        path.write_text("".join([*void, *(sentence(second, 36 / 1.852) for second in range(3, 9))]))
         known = np.isfinite(read_own_speed(path).at(np.arange(10)))
-        assert known.tolist() == [start <= second < start + 6 for second in range(10)]
-        assert ("first position is 3 s after the first sentence" in caplog.text) == (start > 0)
+        assert known.tolist() == [3 <= second < 9 for second in range(10)]
+        assert "first position is 3 s after the first sentence" in caplog.text
 
     def test_other_files_are_refused(self, tmp_path):
         (tmp_path / "a.nmea").write_bytes(b"\xff no sentences")
-        with pytest.raises(InvalidInputError, match="at least two track points with times, got 0"):
+        with pytest.raises(InvalidInputError, match="got 0; record RMC sentences"):
             read_own_speed(tmp_path / "a.nmea")
 
 

@@ -50,6 +50,7 @@ _OTHER_UNITS = {"km/h": 3.6, "mph": 1 / 0.44704, "knots": 3600 / 1852}
 _ZONE, _ZONE_TOLERANCE, _NEAR = re.compile(r"T.*(Z|[+-]\d\d:?\d\d)\s*$", re.IGNORECASE), 10.0, 0.01
 _OUTLYING = 366 * 86400.0  # s from the median time, such as the dates of a receiver without satellites
 _LONGEST_START = 3600.0  # s that a receiver may need to find its position
+_RATE_SENTENCES = 60  # number of sentences, from the first position on, whose times give their rate
 # Factors from the columns of a table to m/s.
 _SPEED_COLUMNS = {"speed_mps": 1.0, "speed_kmh": 1 / 3.6, "speed_mph": 0.44704}
 
@@ -178,9 +179,10 @@ def _from_first_point(points: Floats, name: str) -> Floats:
             _LOGGER.warning("%s: left out %s years from the others, such as of %s", name, count, date)
         points = points[~outlying]
     if len(points) < 2:
+        nmea = name.lower().endswith(".nmea")
+        remedy = "record RMC sentences with dates and checksums" if nmea else "export a track, not a route"
         raise InvalidInputError(
-            f"path {name} must have at least two track points with times, got {len(points)}; export a "
-            "recorded track, not a route"
+            f"path {name} must have at least two track points with times, got {len(points)}; {remedy}"
         )
     return np.asarray(points - [points[0, 0], 0, 0, 0])
 
@@ -345,9 +347,9 @@ def _read_gpx(data: bytes, name: str) -> Floats:
 
 
 _RMC = re.compile(
-    r"\$(?P<text>G[A-Z]RMC,(\d\d)(\d\d)(\d\d(?:\.\d+)?),"
+    r"\$(?P<text>[A-Z]{2}RMC,(\d{6}(?:\.\d+)?)?,"
     r"(?:A,(\d\d)(\d+\.?\d*),([NS]),(\d{3})(\d+\.?\d*),([EW])|V,[\d.]*,[NS]?,[\d.]*,[EW]?),"
-    r"([\d.]*),[^,]*,(\d\d)(\d\d)(\d\d)[^*\s]*)\*(?P<sum>[0-9A-Fa-f]{2})"
+    r"([\d.]*),[^,]*,(\d{6})?[^*\s]*)\*(?P<sum>[0-9A-Fa-f]{2})"
 )
 
 
@@ -359,12 +361,11 @@ def _read_nmea(data: bytes, name: str) -> Floats:
     """
     rows = list[tuple[Any, ...]]()
     for found in _RMC.finditer(data.decode("ascii", "replace")):
-        _, hour, minute, second, lat, lat_minutes, south, lon, lon_minutes, west, knots, *date, given = (
-            found.groups()
-        )
+        _, clock, lat, lat_minutes, south, lon, lon_minutes, west, knots, date, given = found.groups()
         if functools.reduce(lambda bits, letter: bits ^ ord(letter), found["text"], 0) == int(given, 16):
-            day, month, year = date
-            time = f"20{year}-{month}-{day}T{hour}:{minute}:{second}"
+            # A receiver that has just started knows neither the date nor the time.
+            day, time = date or "", clock or ""
+            time = f"20{day[4:]}-{day[2:4]}-{day[:2]}T{time[:2]}:{time[2:4]}:{time[4:]}"
             if lat is None:
                 rows.append((time, None, None, None))
                 continue
@@ -377,18 +378,21 @@ def _read_nmea(data: bytes, name: str) -> Floats:
 
 
 def _from_first_sentence(points: Floats, name: str) -> Floats:
-    """Leave out points without a position, but keep the time of those before the first position."""
-    located = np.isfinite(points[:, 2])
-    if not located.any():
+    """Leave out points without a position, but keep the time of the first sentence."""
+    located = np.isfinite(points[:, [0, 2]]).all(axis=1)
+    if located.sum() < 2 or located[0]:
         return points[located]
     first = int(np.argmax(located))
     seconds = points[first, 0] - points[:first, 0]
-    # The clock of a receiver without satellites may be wrong.
-    waiting = seconds[(seconds > 0) & (seconds < _LONGEST_START)].max(initial=0.0)
-    if not waiting:
-        return points[located]
+    # The clock of a receiver without satellites may be wrong, or unset: sentences have a constant rate.
+    right = (seconds > 0) & (seconds < _LONGEST_START)
+    start = int(np.argmax(right)) if right.any() else first
+    after = points[first:, 0]
+    after = after[np.isfinite(after)][:_RATE_SENTENCES]
+    waiting = float(points[first, 0] - points[start, 0] + start * (after[-1] - after[0]) / (len(after) - 1))
     _LOGGER.warning(
-        "%s: the first position is %g s after the first sentence, with which the video starts", name, waiting
+        "%s: the first position is %g s after the first sentence, with which the video starts",
+        *(name, round(waiting, 3)),
     )
     return np.concatenate([[(points[first, 0] - waiting, *[math.nan] * 3)], points[located]])
 
