@@ -29,7 +29,7 @@ from vehicle_detection.cli.horizon import warn_of_contradiction
 from vehicle_detection.cli.options import parse_time
 from vehicle_detection.cli.video import read_speed
 from vehicle_detection.tracking import HorizonEstimate
-from vehicle_detection.video import FrameSource
+from vehicle_detection.video import FrameSource, list_files
 
 
 def test_the_segments_of_a_card_become_one_video(material, tmp_path):
@@ -335,6 +335,7 @@ def test_the_copy_is_named_after_its_source_and_replaces_no_file(clip, tmp_path)
         (("-o", tmp_path / "other"), "other/drive_tracked.mp4"),
     ):
         assert f"wrote {tmp_path / written}" in succeed("video", source, "--end", 0.1, *words)
+    assert list_files(f"{tmp_path}/*") == [source]  # no copies
     before = contents(tmp_path)
     succeed("video", source, "--end", 0.1, "--tracks", tmp_path / "t.csv")
     assert contents(tmp_path) == sorted([*before, "t.csv"])

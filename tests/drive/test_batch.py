@@ -319,6 +319,7 @@ def test_linked_folders_are_searched_once(card, tmp_path):
     shutil.copy(card / "20260131_093000_F.mp4", card / ".Trash")
     shutil.copy(card / "20260131_093000_F.mp4", card / "lost+found")
     names = sorted(file.name for file in card.glob("*.mp4"))
+    shutil.copy(card / "20260131_093000_F.mp4", card / "20260131_093000_F_tracked.mp4")
     assert [*list_videos([folder])] == [f"{folder}/a/{name}" for name in names]
     assert [*list_videos([card, folder])] == [f"{card}/{name}" for name in names]
 

@@ -63,6 +63,7 @@ from vehicle_detection.video import (
     open_filesystem,
     open_source,
     process_video,
+    select_videos,
     walk_files,
     with_retries,
 )
@@ -101,12 +102,11 @@ def list_videos(sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str
 
 def _list_local(path: Path) -> Iterator[tuple[str, Facts]]:
     if path.is_dir():
-        files: Iterable[Path] = (each for each in walk_files(path, "sources") if is_video_file(each))
+        files: Iterable[Path] = select_videos(walk_files(path, "sources"))
     elif path.exists():
         files = [path]
     elif glob.has_magic(str(path)):
-        files = (Path(each) for each in glob.iglob(str(path), recursive=True))
-        files = (each for each in files if is_video_file(each))
+        files = select_videos(Path(each) for each in glob.iglob(str(path), recursive=True))
     else:
         raise InvalidInputError(f"sources {path} does not exist; check the path")
     return ((os.path.abspath(each), {}) for each in files if each.is_file())

@@ -1,6 +1,14 @@
 from .clips import annotate_clip
 from .engine import TrackRun, VideoDetector, VideoReport, track
-from .files import download, is_video_file, list_files, open_filesystem, walk_files, with_retries
+from .files import (
+    download,
+    is_video_file,
+    list_files,
+    open_filesystem,
+    select_videos,
+    walk_files,
+    with_retries,
+)
 from .horizon import estimate_video_horizon
 from .opening import Source, borrow_source, open_source, probe_video, read_frames
 from .probe import VideoInfo
@@ -32,6 +40,7 @@ __all__ = [
     "probe_video",
     "process_video",
     "read_frames",
+    "select_videos",
     "track",
     "walk_files",
     "with_retries",

@@ -7,7 +7,7 @@ import glob
 import os
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 from urllib.parse import unquote
@@ -33,6 +33,8 @@ VIDEO_SUFFIXES = {
 }  # fmt: skip
 """Suffixes of the videos that a folder is searched for."""
 
+# Name of an annotated copy that the command `video` writes beside its source.
+_COPY = re.compile(r"(.+)_tracked(_\d+)?\.mp4")
 # Seconds before the second and the third attempt of a request.
 _RETRY_DELAYS = (0.2, 1.0)
 # Maximum length of a file name, in characters that may take four bytes each.
@@ -65,11 +67,19 @@ def list_files(source: str | os.PathLike[str]) -> list[Path]:
     else:
         return []
     images = [each for each in found if each.suffix.lower() in IMAGE_SUFFIXES]
-    files = [each for each in found if is_video_file(each)]
+    files = select_videos(found)
     files = files or sorted(images, key=lambda image: natural_key(str(image)))
     if not files:
         raise InvalidInputError(f"source {path} holds no videos and no images; check the path")
     return files
+
+
+def select_videos(files: Iterable[Path]) -> list[Path]:
+    """Select videos by their names; a copy such as ``drive_tracked.mp4`` only if its source is not there."""
+    videos = [each for each in files if is_video_file(each)]
+    sources = {each.with_suffix("") for each in videos}
+    copies = ((each, _COPY.fullmatch(each.name)) for each in videos)
+    return [each for each, copy in copies if copy is None or each.with_name(copy[1]) not in sources]
 
 
 def walk_files(folder: Path, name: str = "source") -> Iterator[Path]:
