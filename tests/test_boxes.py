@@ -158,7 +158,6 @@ def test_confidences_are_probabilities():
     [
         ([[0, 0, 1, 1]], [[1]], r"scores must be one number for each of the 1 boxes"),
         ([], [1], "scores must be one number for each of the 0 boxes"),
-        ([[0, 0, 1, 1]], [1, 2], "scores must be one number for each of the 1 boxes"),
         ([[0, 0, 1, 1]], [np.inf], "scores must be finite, got NaN or infinity"),
         ([[1, 0, 0, 1]], [1], r"boxes\[0\] must be .* x1 <= x2"),
     ],

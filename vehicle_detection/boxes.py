@@ -255,7 +255,8 @@ def _score_column(values: ArrayLike, name: str, count: int | None = None) -> Flo
         array = array.reshape(-1).astype(np.float64)
     if array.ndim != 1 or array.dtype.kind not in "iuf" or (count is not None and len(array) != count):
         each = "each box" if count is None else f"each of the {count} boxes"
-        raise InvalidInputError(f"{name} must be one number for {each}, got {describe(values)}")
+        remedy = "; pass names of classes as labels" if name == "class_ids" else ""
+        raise InvalidInputError(f"{name} must be one number for {each}, got {describe(values)}{remedy}")
     if not np.isfinite(array).all():
         raise InvalidInputError(f"{name} must be finite, got NaN or infinity; drop those rows")
     return array.astype(np.float64, copy=False)

@@ -104,7 +104,8 @@ def _check_model(model: Any) -> Model:
         remedy = f"convert it with VehicleClassifier.from_pipeline({argument}, params)"
         raise invalid("model", "not be an estimator of scikit-learn", model, remedy)
     if isinstance(model, type) or not hasattr(model, "open_search"):
-        raise invalid("model", "be a name, a model file, or what load_model returns", model, "omit it")
+        remedy = "pass a function that finds boxes to detector_from"
+        raise invalid("model", "be a name, a model file, or what load_model returns", model, remedy)
     return cast(Model, model)
 
 
@@ -387,7 +388,7 @@ class VehicleDetector(Closing):
         jobs: int | None = None,
     ) -> None:
         check.instance(track_params, "track_params", TrackParams | None, "omit it for the default")
-        check.instance(annotator, "annotator", Annotator | None, "omit it for the default")
+        check.instance(annotator, "annotator", Annotator | None, "pass Annotator(DrawParams(...))")
         self.track_params = track_params or TrackParams()
         options: dict[str, Any] = {"conf": conf, "search_params": search_params, "camera": camera}
         options |= {"region_params": region_params, "jobs": jobs}

@@ -119,7 +119,7 @@ class FeatureParams(fields.Checked):
 
     @classmethod
     def preset(cls, name: str) -> FeatureParams:
-        """Parameters by name: of three course projects, or ``"lab-9432"`` of the shipped model "highway"."""
+        """Parameters by name, one of `PRESETS`; ``"lab-9432"`` are those of the shipped model "highway"."""
         check.choice(name, "preset", cls.PRESETS)
         return cls(**cls.PRESETS[name])
 

@@ -106,5 +106,6 @@ def test_a_detector_may_be_a_model(clip):
 
 
 def test_results_without_frames_cannot_be_written(clip, detector, tmp_path):
-    with pytest.raises(InvalidInputError, match="results must hold their frames; pass frames=True to track"):
-        write_video(track(clip, detector), tmp_path / "out.mp4", detector.annotator)
+    for results in (iter([]), track(clip, detector)):
+        with pytest.raises(InvalidInputError, match=r"results must .*; pass .*frames=True"):
+            write_video(results, tmp_path / "out.mp4", detector.annotator)

@@ -258,8 +258,8 @@ def warn_of_first_bin(image: Image, limits: tuple[float, float] | None, color_sp
         low, high = limits
         warn(
             f"the image has values 0-1, which are all in the first bin of a histogram of {low:g}-{high:g}: "
-            'its colors are lost. Pass hist_range=(0, 1) or None, or read PNG files as 0-255: imread="cv2"; '
-            "find_cars divides by 255 unless divide_by=1 is passed, and set_lesson_defaults sets them all"
+            "its colors are lost. Pass hist_range=(0, 1) or None, or compute all features from 0-255: "
+            'set_lesson_defaults(imread="cv2", divide_by=1)'
         )
 
 

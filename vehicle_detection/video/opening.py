@@ -202,8 +202,8 @@ def _open(source: object, options: _Options) -> FrameSource:
     files = list_files(text) or [check_file(path)]
     if len(files) > 1 and is_video_file(files[0]):
         raise InvalidInputError(
-            f"source {path} holds {len(files)} videos; open the segments of one trip with open_trip, or pass "
-            "a list of consecutive files"
+            f"source {path} holds {len(files)} videos; open the segments of one trip with open_trip, pass a "
+            "list of consecutive files, or process all of them with run_batch"
         )
     return _open_files(files, options)
 

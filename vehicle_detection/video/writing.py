@@ -293,6 +293,7 @@ def write_video(
     >>> write_video(results, None, detector.annotator).frames
     2
     """
+    check.instance(results, "results", TrackRun, "pass what track(..., frames=True) returned")
     with contextlib.ExitStack() as stack:
         stack.enter_context(results)
         stack.enter_context(_name_changed_source(results.source))
