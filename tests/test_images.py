@@ -33,7 +33,7 @@ def bgr(image):
     return np.ascontiguousarray(image[..., ::-1])
 
 
-def test_the_content_of_a_file_is_an_image(tmp_path, picture, monkeypatch):
+def test_the_content_of_a_file_is_an_image(tmp_path, picture):
     write_image(tmp_path / "a.png", picture)
     data = (tmp_path / "a.png").read_bytes()
     np.testing.assert_array_equal(read_image(data), picture)
@@ -42,9 +42,6 @@ def test_the_content_of_a_file_is_an_image(tmp_path, picture, monkeypatch):
     for other in (io.BytesIO(data), bytearray(data)):
         with pytest.raises(InvalidInputError, match=r"path must be a file name or bytes, got .*; pass bytes"):
             read_image(other)
-    monkeypatch.setenv("VEHICLE_DETECTION_MAX_PIXELS", "100")
-    with pytest.raises(InvalidInputError, match=r"^the bytes must have at most 100 pixels, got 60x40"):
-        read_image(data)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".JPG", ".WEBP"])
@@ -159,8 +156,8 @@ def test_the_limit_of_pixels_is_adjustable(picture, monkeypatch):
     monkeypatch.setenv("VEHICLE_DETECTION_MAX_PIXELS", str(picture.size // 3))
     np.testing.assert_array_equal(decode_image(data, "a.png"), picture)
     monkeypatch.setenv("VEHICLE_DETECTION_MAX_PIXELS", str(picture.size // 3 - 1))
-    with pytest.raises(InvalidInputError, match="must have at most"):
-        decode_image(data, "a.png")
+    with pytest.raises(InvalidInputError, match=r"^the bytes must have at most 2,399 pixels, got 60x40"):
+        read_image(data)
     for text in ("many", "0", "-1", "1" * 30):
         monkeypatch.setenv("VEHICLE_DETECTION_MAX_PIXELS", text)
         with pytest.raises(InvalidInputError, match="_MAX_PIXELS must be a number of pixels"):
@@ -220,12 +217,9 @@ def test_images_of_pillow_with_16_bits_become_8_bits(picture):
     deep = Image.fromarray(gray.astype(np.uint16) * 257)
     assert deep.mode == "I;16"
     np.testing.assert_array_equal(image_array(deep), np.stack([gray] * 3, axis=2))
-
-
-@pytest.mark.parametrize("mode", ["I", "F"])
-def test_images_of_pillow_with_an_unknown_range_are_refused(mode):
-    with pytest.raises(InvalidInputError, match=f"range of values that is known, .* mode {mode}; scale"):
-        image_array(Image.new(mode, (64, 64)))
+    for mode in ("I", "F"):
+        with pytest.raises(InvalidInputError, match=f"range of values that is known, .* mode {mode}; scale"):
+            image_array(Image.new(mode, (64, 64)))
 
 
 def test_a_failed_write_keeps_the_earlier_file(tmp_path, picture, monkeypatch):

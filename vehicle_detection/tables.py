@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import Floats, check, invalid, is_listing, natural_key, pluralize, shorten
+from vehicle_detection._common import (
+    Floats,
+    check,
+    invalid,
+    is_listing,
+    name_vehicles,
+    natural_key,
+    pluralize,
+    shorten,
+)
 from vehicle_detection.boxes import TABLE_COLUMNS, Detections
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.tracking import TRACK_VALUES, UNKNOWN_LABEL, is_result, shown_tracks
@@ -534,12 +543,19 @@ def _vehicle_rows(
 def check_classes(
     source: object, found: Collection[str], wanted: Collection[str], kind: str = "class"
 ) -> None:
-    """Refuse a file in which no class is that of vehicles: it would have no box."""
+    """Refuse a file in which no class is that of vehicles: it would have no box. Warn of similar classes."""
     if not any(name in wanted for name in found):
         listed = shorten(", ".join(map(repr, sorted(found))), 300) or "none"
         names = ", ".join(sorted(wanted))
         remedy = "name those of vehicles with classes="
         raise DatasetError(f"{source} has no {kind} among {names}; found {listed}; {remedy}")
+    others = sorted({*name_vehicles(found)} - {*wanted, *LOOKALIKE_CLASSES})
+    if wanted is VEHICLE_CLASSES and others:
+        _LOGGER.warning(
+            "%s: vehicles of class %s are left out; classes= selects all classes of vehicles",
+            source,
+            shorten(", ".join(others)),
+        )
 
 
 def parse_number(cell: Any, name: str, place: str) -> float:

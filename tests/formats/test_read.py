@@ -159,16 +159,10 @@ def test_kitti_folder(tmp_path):
 
 
 def test_mot_file(tmp_path):
-    truth = read_labels(written(tmp_path, "1,3,10,20,30,40,1,1,1\n2,3,11,20,30,40,0,1,0.5\n", "gt.txt"))
-    assert truth["frame"].tolist() == [0, 1]
-    assert truth.boxes[0].tolist() == [9, 19, 39, 59]  # MOTChallenge counts pixels from 1
-    assert truth["ignore"].tolist() == [False, True]
-    assert "score" not in truth.columns
-    found = read_labels(written(tmp_path, "1, 3, 10, 20, 30, 40, 0.75, -1, -1, -1,\r\n", "mot.txt"))
-    assert found["score"].tolist() == [0.75]
     assert read_labels(written(tmp_path, "1 -1 10 20 30 40\n", "bare.txt"))["track_id"].tolist() == [-1]
-    by_class = written(tmp_path, "1,1,0,0,9,9,1,1,1\n1,2,0,0,9,9,1,3,1\n", "gt.txt")
-    assert read_labels(by_class, classes={3})["track_id"].tolist() == [2]
+    by_class = written(tmp_path, "1,1,0,0,9,9,1,1,1\n2,2,0,0,9,9,1,3,0.5\n", "gt.txt")
+    truth = read_labels(by_class, classes={3})
+    assert (truth["track_id"].tolist(), truth["frame"].tolist()) == ([2], [1])
 
 
 def coco(**changes):
@@ -189,7 +183,7 @@ BOX = {"image_id": 5, "category_id": 1, "bbox": [1, 2, 3, 4]}
 MIXED = [json.dumps({"frame": frame, "track": 1, "x1": 1, "y1": 1, "x2": 9, "y2": 9}) for frame in (0, "a")]
 
 
-def test_coco_file(tmp_path):
+def test_coco_file(tmp_path, caplog):
     labels = read_labels(written(tmp_path, coco(), "instances.json"))
     assert labels.frame_keys == ("a.jpg", "b.jpg")
     assert labels.boxes.tolist() == [[10, 20, 40, 60], [0, 0, 60, 40], [90, 0, 189, 40]]
@@ -203,8 +197,10 @@ def test_coco_file(tmp_path):
     entries = [BOX | {"ignore": 1}, BOX | {"track_id": 0}, BOX | {"track_id": 1}]
     found = read_labels(written(tmp_path, coco(annotations=entries), "b.json"))
     assert len(set(found["track_id"].tolist())) == 3
-    spaced = coco(annotations=[BOX], categories=[{"id": 1, "name": " Car "}])
-    assert read_labels(written(tmp_path, spaced, "c.json"))["label"].tolist() == ["car"]
+    names = dict(enumerate((" Car ", "Mid Trucks", "bus stop"), 1))
+    spaced = coco(categories=[{"id": number, "name": name} for number, name in names.items()])
+    assert set(read_labels(written(tmp_path, spaced, "c.json"))["label"]) == {"car"}
+    assert "c.json: vehicles of class mid trucks are left out; classes= selects" in caplog.text
 
 
 @pytest.mark.parametrize(

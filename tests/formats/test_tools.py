@@ -73,11 +73,6 @@ def test_nine_columns_that_are_no_labels_are_not_ignored(flag, visibility, tmp_p
     assert read_labels(tmp_path / "a.txt")["score"].tolist() == [float(flag)]
 
 
-def test_classes_of_results_with_nine_columns(tmp_path):
-    (tmp_path / "a.txt").write_text("1,1,11,21,30,40,0.9,2,-1\n1,2,11,21,30,40,0.2,0,-1")
-    assert read_labels(tmp_path / "a.txt", classes=["2"])["score"].tolist() == [0.9]
-
-
 def test_labels_of_kitti_tracking(tmp_path):
     rest = "0 0 -1.57 10 20 90 60 1.5 1.6 4 1 2 30 -1.5"
     text = f"0 3 Car {rest}\n0 -1 DontCare {rest}\n2 3 Van {rest}\n2 5 Cyclist {rest}\n2 7 Tram {rest}\n"
@@ -94,12 +89,8 @@ def test_labels_of_kitti_tracking(tmp_path):
 def test_yolo_of_cvat(tmp_path):
     folder = tmp_path / "obj_train_data"
     folder.mkdir()
-    for name, text in (
-        ("obj.names", "person\r\ncar\r\n"),
-        ("obj.data", "classes = 2"),
-        ("train.txt", "a.jpg"),
-    ):
-        (tmp_path / name).write_text(text)
+    (tmp_path / "obj.names").write_text("person\r\ncar\r\n")
+    (tmp_path / "train.txt").write_text("a.jpg")
     (folder / "frame_000000.txt").write_text("1 0.5 0.5 0.2 0.4\n0 0.5 0.5 0.1 0.1\n")
     (folder / "frame_000001.txt").write_text("")
     for path in (tmp_path, folder):
@@ -110,7 +101,11 @@ def test_yolo_of_cvat(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "text"),
-    [("a.txt", "1,1,9,9,30,40,0.9,0\n1,2,9,9,30,40,0.9,2"), ("labels/a.txt", "0 .5 .5 .2 .2\n9 .5 .5 .2 .2")],
+    [
+        ("a.txt", "1,1,9,9,30,40,0.9,0\n1,2,9,9,30,40,0.9,2"),
+        ("a.txt", "1,1,9,9,30,40,0.9,0,-1\n1,2,9,9,30,40,0.2,2,-1"),
+        ("labels/a.txt", "0 .5 .5 .2 .2\n9 .5 .5 .2 .2"),
+    ],
 )
 def test_classes_that_are_numbers_are_read_with_a_warning(name, text, tmp_path, caplog):
     path = tmp_path / name

@@ -123,10 +123,19 @@ def test_other_classes(tmp_path, kind):
         load(tmp_path, graph, classes="car")
 
 
-def test_all_classes_without_known_names(tmp_path):
-    model = load(tmp_path, constant_network({"output0": dense(CELLS, 3).transpose(0, 2, 1)}))
-    assert model.class_ids is None
-    assert len(find(model).vehicles) == 2
+def test_every_class_with_the_name_of_a_vehicle_counts(tmp_path, caplog):
+    outputs = {"output0": dense(CELLS, 3).transpose(0, 2, 1)}
+    assert len(find(load(tmp_path, constant_network(outputs))).vehicles) == 2  # without names
+    network = constant_network(outputs, metadata={"names": "['car', 'Pickup Truck', 'Car']"})
+    for options in ({}, {"classes": ["car"]}):
+        assert load(tmp_path, network, **options).class_ids.tolist() == [0, 2]
+    assert caplog.text.count("vehicles of class pickup truck are left out") == 1
+
+
+def test_logits_are_no_probabilities(tmp_path):
+    model = load(tmp_path, constant_network({"output0": 5 * dense(CELLS).transpose(0, 2, 1)}))
+    with pytest.raises(ModelFileError, match="invalid values: scores are not probabilities, but up to 4;"):
+        find(model)
 
 
 def test_a_network_whose_names_are_no_vehicles_needs_classes(tmp_path):
@@ -151,9 +160,9 @@ def test_scores_of_a_dynamic_graph(tmp_path):
     cells = 40 * 40 + 20 * 20 + 10 * 10
     graph = constant_network({"output0": dense(cells, objectness=True)}, size=None, dynamic=True)
     assert load(tmp_path, graph).output_format.kind == "yolox"
-    rows = np.zeros((1, 3 * cells, 6), np.float32)
-    graph = constant_network({"output0": rows}, size=None, dynamic=True)
-    assert load(tmp_path, graph).output_format == OutputFormat("yolov5", 1)
+    for count in (3 * cells, 3 * (cells + 25)):  # also with cells of stride 64
+        graph = constant_network({"output0": np.zeros((1, count, 6), np.float32)}, size=None, dynamic=True)
+        assert load(tmp_path, graph).output_format == OutputFormat("yolov5", 1)
 
 
 @pytest.mark.parametrize(
@@ -176,6 +185,7 @@ def test_unknown_outputs(tmp_path, outputs):
 @given(seed=st.integers(0, 2**32 - 1), spread=st.floats(0, 1e4), low=st.floats(0, 1))
 def test_candidates_are_sorted_and_above_the_minimum(kind, seed, spread, low):
     array = np.random.default_rng(seed).normal(0, spread, (1, CELLS, 9)).astype(np.float32)
+    array[..., 4:] %= 1
     outputs, order = [array[..., :6]], (0,)
     if kind == "columns":
         outputs = [array.transpose(0, 2, 1)]

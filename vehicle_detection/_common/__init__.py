@@ -26,6 +26,7 @@ from vehicle_detection._common.text import (
     is_url,
     is_web_address,
     local_path,
+    name_vehicles,
     natural_key,
     parse_yaml,
     pluralize,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from typing import Any
 from urllib.parse import unquote_plus
 
@@ -34,6 +35,20 @@ _SIGNATURE = re.compile(
     r"x-(amz|goog)-.*|awsaccesskeyid|googleaccessid|expires|signature|key-pair-id|policy", re.IGNORECASE
 )
 _AZURE = re.compile(r"sig|s[eprstv]|srt|spr|sip|sdd|sk(oid|tid|[estv])|saoid|suoid|scid", re.IGNORECASE)
+
+_VEHICLE = re.compile(
+    "(car|van|truck|bus|vehicle|suv|pickup|taxi|sedan|hatchback|minivan|minibus)s?|buses|lorry|lorries"
+)
+
+
+def name_vehicles(names: Iterable[str]) -> list[str]:
+    """Select the names of classes that seem to be vehicles by their last word: "big truck", "cars", "bus-l".
+
+    >>> name_vehicles(["Fire_Truck", "truck-xl-", "car wheel", "person"])
+    ['Fire_Truck', 'truck-xl-']
+    """
+    words = {name: [word for word in re.split("[^a-z]+", name.lower()) if len(word) > 2] for name in names}
+    return [name for name, each in words.items() if each and _VEHICLE.fullmatch(each[-1])]
 
 
 def parse_yaml(text: str) -> Any:

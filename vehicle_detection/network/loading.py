@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import os
 from collections.abc import Collection
 from importlib import resources
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Limit, check, invalid, read_regular_file
+from vehicle_detection._common import Limit, check, invalid, name_vehicles, read_regular_file
 from vehicle_detection.boxes import logit
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.network.model import INPUT_SIZE, NetworkModel, NetworkParams
@@ -33,6 +34,8 @@ from vehicle_detection.network.tensors import (
     recognize,
     usual_names,
 )
+
+_LOGGER = logging.getLogger(__name__)
 
 METADATA_KEY = "vehicle_detection"
 """Key of the ONNX metadata with the parameters of a network of this library, as JSON."""
@@ -217,9 +220,18 @@ def _class_ids(
 ) -> NDArray[np.intp] | None:
     """Numbers of the classes to keep; None: all."""
     known = model.classes or {}
-    numbers = {text.lower(): number for number, text in known.items()}
+    numbers: dict[str, list[int]] = {}  # merged data sets have several, such as those of "car" and "Car"
+    for key, text in known.items():
+        numbers.setdefault(text.strip().lower(), []).append(key)
     if classes is None:
-        ids = [numbers[text] for text in VEHICLE_CLASSES if text in numbers]
+        ids = [number for text in VEHICLE_CLASSES for number in numbers.get(text, ())]
+        others = sorted({*name_vehicles(numbers)} - {*VEHICLE_CLASSES})
+        if ids and others:
+            _LOGGER.warning(
+                "%s: vehicles of class %s are left out; classes= selects all classes of vehicles",
+                name,
+                ", ".join(others),
+            )
         if known and not ids:
             listed = ", ".join(known.values())
             raise InvalidInputError(
@@ -230,13 +242,14 @@ def _class_ids(
     ids = []
     count = model.output_format.n_classes or 1 << 31
     for each in check.sequence(classes, "classes", "names or numbers of classes"):
-        number = numbers.get(each.lower(), -1) if isinstance(each, str) else each
+        found = numbers.get(each.strip().lower(), [-1]) if isinstance(each, str) else [each]
+        number = found[0]
         is_number = isinstance(number, (int, np.integer)) and not isinstance(number, bool)
         if not is_number or not 0 <= number < count or (known and number not in known):
             listed = ", ".join(f"{text} ({n})" for n, text in known.items())
             listed = listed or "numbers only" + f", below {count}" * (count < 1 << 31)
             raise invalid("classes", f"be classes of {name}", each, f"it has {listed}")
-        ids.append(int(number))
+        ids += map(int, found)
     if not ids:
         raise InvalidInputError("classes must hold at least one class; omit it for all vehicles")
     return np.array(sorted(set(ids)), np.intp)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import Floats, atomic_write, fields, single_threaded_opencv
-from vehicle_detection.boxes import Detections, Platt, box_areas, greedy_nms, logit
+from vehicle_detection.boxes import Detections, Platt, greedy_nms, logit
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.network.runtime import Array, Device, Port, Runtime, Session, open_session
 from vehicle_detection.network.tensors import Candidates, InputFormat, OutputFormat, Size
@@ -249,7 +249,7 @@ class NetworkSearch(FrameSearch):
         factors = np.array([width / scaled[1], height / scaled[0]] * 2)
         trimmed = trim(found.boxes, model.margins, scaled)
         boxes = np.clip(trimmed * factors, 0.0, [width, height, width, height])
-        inside = box_areas(boxes) > 0
+        inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
         return Candidates(boxes[inside], found.probabilities[inside], found.class_ids[inside])
 
     def _open(self) -> Session:

@@ -40,6 +40,10 @@ ACCEPTED = (
 MAX_CANDIDATES = 1000
 """Maximum number of boxes before suppression."""
 
+# Largest score with the rounding errors of 8 bits; higher ones are of a network without its last function, or
+# of another kind.
+_MAX_PROBABILITY = 1.02
+
 # Boxes of a network that predicts sets, without suppression.
 _MAX_SET = 1000
 
@@ -203,15 +207,18 @@ class OutputFormat:
         """Decode the outputs for an input of this height and width to boxes of `classes` (None: all).
 
         The boxes are in pixels of the input, and the class of each is its most probable one. A
-        `ModelFileError` says what is not finite, without a name.
+        `ModelFileError` says what is not finite or no probability, without a name.
         """
         boxes, scores, objectness, labels = self._split(outputs)
         kept = scores if classes is None or labels is not None else scores[classes[classes < len(scores)]]
         best = kept[0] if len(kept) == 1 else kept.max(axis=0, initial=0)
+        highest = best.max(initial=0)
         if objectness is not None:
             best = best * objectness
         if not np.isfinite(best.sum(dtype=np.float64)):
             raise ModelFileError("scores are not finite")
+        if highest > _MAX_PROBABILITY:
+            raise ModelFileError(f"scores are not probabilities, but up to {highest:.3g}")
         rows = np.flatnonzero(best >= min_probability)
         if labels is None:
             class_ids = scores[:, rows].argmax(axis=0) if len(scores) > 1 else np.zeros(len(rows), np.intp)
@@ -308,7 +315,8 @@ def _recognize_one(first: int, second: int, cells: int, names: int | None) -> Ou
     by_columns = first <= second if (first in counts) == (second in counts) else second in counts
     if by_columns:
         return OutputFormat("columns", first - 4) if first > 4 else None
-    if second == 6 and first not in counts:
+    # YOLOv5 with a stride of 64 has other counts, and with one class 6 values, too.
+    if second == 6 and first not in counts and (first <= _MAX_SET or names not in (None, 1)):
         return OutputFormat("final", names)
     if second < 5:
         return None
