@@ -379,7 +379,7 @@ def _read_nmea(data: bytes, name: str) -> Floats:
 
 def _from_first_sentence(points: Floats, name: str) -> Floats:
     """Leave out points without a position, but keep the time of the first sentence."""
-    located = np.isfinite(points[:, [0, 2]]).all(axis=1)
+    located = np.isfinite(points[:, 0] + points[:, 2])
     if located.sum() < 2 or located[0]:
         return points[located]
     first = int(np.argmax(located))
