@@ -109,11 +109,6 @@ class TestGpx:
         assert np.isnan(read_own_speed(path, offset=-2).at([1.0]))
         assert read_own_speed(path, offset=-2).at([2.0]).tolist() == [0.0]
 
-    def test_a_gap_is_unknown(self, tmp_path):
-        points = [(50, 10, time_of(second), "<speed>9</speed>") for second in (0, 1, 30, 31)]
-        found = read_own_speed(write_gpx(tmp_path / "a.gpx", points)).at([1, 2, 20, 30, 30.5])
-        np.testing.assert_array_equal(found, [9, np.nan, np.nan, 9, 9])
-
     def test_repeated_unsorted_and_untimed_points(self, tmp_path):
         known = (time_of(2), 3), (time_of(0), 1), (time_of(0), 7), ("noon", 90)
         points = [(50, 10, time, f"<speed>{speed}</speed>") for time, speed in known]

@@ -67,6 +67,19 @@ def test_gaps_in_the_times_of_a_transport_stream_are_no_undecodable_frames(folde
     assert count(copy) == (20, "")
 
 
+@pytest.mark.parametrize(("suffix", "frames"), [("ts", 80), ("mp4", 40)])
+def test_recordings_that_were_joined_byte_by_byte(tmp_path, caplog, suffix, frames):
+    """Of MP4, only the first one can be read; the times of MPEG-TS begin again."""
+    path = write_clip(tmp_path / f"a.{suffix}", gray_frames(20) * 2, options=("-g", 10))
+    path.write_bytes(path.read_bytes() * 2)
+    with open_source(path) as source:
+        assert (source.info.frames, sum(1 for _ in source)) == (frames, frames)
+    assert "seems to be joined of several" in caplog.text
+    if suffix == "ts":
+        with pytest.raises(VideoError, match="copy it first"):
+            read_frames(path, start=1.0)
+
+
 def test_an_empty_file_is_named(tmp_path):
     (tmp_path / "empty.mp4").write_bytes(b"")
     with pytest.raises(VideoError, match=r"empty.mp4 is not a video .*\(it is empty\)"):
@@ -90,9 +103,9 @@ def test_whole_videos_with_longer_sound_are_not_damaged(folder, suffix):
         assert count(path, start=0.2)[1] == ""
 
 
-@pytest.mark.parametrize("options", [["-bf", 3], ["-bf", 0, "-vf", "setpts=PTS*1.001"], ["-r", "59.94"]])
+@pytest.mark.parametrize("options", ["-bf 3", "-vf setpts=PTS*1.001", "-r 59.94", "-f mpeg -c:v mpeg2video"])
 def test_whole_videos_are_not_damaged(folder, options):
-    path = write_clip(folder / "whole.mp4", gray_frames(20), options=options)
+    path = write_clip(folder / "whole.mp4", gray_frames(20) * 2, options=options.split())
     assert count(path)[1] == ""
 
 

@@ -25,7 +25,7 @@ from vehicle_detection.video.ffmpeg import (
 )
 from vehicle_detection.video.files import check_file, download, is_video_file, list_files
 from vehicle_detection.video.live import LiveStream
-from vehicle_detection.video.probe import VideoInfo, probe
+from vehicle_detection.video.probe import VideoInfo, joined_length, probe
 from vehicle_detection.video.reading import FrameReader, check_span, frame_range
 from vehicle_detection.video.sources import (
     NO_RATE,
@@ -152,6 +152,12 @@ class _Options:
                 f"fps must be omitted for {name}, whose frames have times of their own "
                 f"({float(info.fps):.5g} frames/s); to change its speed, convert it with ffmpeg"
             )
+        if info.other_index:
+            self._warn(
+                "%s seems to be joined of several files, of which only the first one is read; read them as a "
+                "list or a folder, or join them with ffmpeg -f concat",
+                name,
+            )
         if info.other_streams and self.stream is None:
             self._warn(
                 "%s has several video streams: %d (%dx%d) is read, not %s; choose another one by its number, "
@@ -232,11 +238,25 @@ def _open_files(files: Sequence[Path], options: _Options) -> FrameSource:
             f"source must be videos or images, got both ({files[0]}, {images[0]}); select one kind"
         )
     if len(files) == 1:
-        return VideoFile(files[0], options.probe(files[0]))
+        return VideoFile(files[0], _with_joined(files[0], options.probe(files[0])))
     broken = next((path for path in files if "\n" in str(path) or "\r" in str(path)), None)
     if broken is not None:  # the list of files for ffmpeg has a line for each
         raise InvalidInputError(f"source {str(broken)!r} has a line break in its name; rename the file")
     return VideoSegments(files, options.probe, strict=options.strict)
+
+
+def _with_joined(path: Path, info: VideoInfo) -> VideoInfo:
+    """Return the properties of a file with the length of all the recordings that were joined to it."""
+    length = joined_length(path, info)
+    if not length:
+        return info
+    _LOGGER.warning(
+        "%s seems to be joined of several recordings, whose times begin again: it can only be read from its "
+        "beginning; for other parts, copy it first: ffmpeg -i IN -c copy OUT.mkv",
+        path,
+    )
+    frames = round(length * info.fps)
+    return replace(info, duration=length, frames=frames, times_restart=True)
 
 
 def _open_stdin(options: _Options) -> FrameSource:
@@ -288,7 +308,7 @@ def _download(url: str, options: _Options) -> FrameSource:
     with contextlib.ExitStack() as on_error:
         folder = on_error.enter_context(temporary_folder(Path(tempfile.gettempdir()), "vehicle-source"))
         path = download(url, folder)
-        source = VideoFile(path, options.probe(path))
+        source = VideoFile(path, _with_joined(path, options.probe(path)))
         source.name = source_name(url)
         source._on_close = on_error.pop_all()
     return source
@@ -336,6 +356,6 @@ def read_frames(
     ...     means = [frame.mean() for index, time, frame in frames]
     """
     path, span = check_file(source), check_span(start, end)
-    info = _Options(None, None, None, False, strict).probe(path)
+    info = _with_joined(path, _Options(None, None, None, False, strict).probe(path))
     first, count = frame_range(info, *span)
     return FrameReader(path, info, first=first, count=count, strict=strict)

@@ -37,6 +37,8 @@ from vehicle_detection.video.yuv import ColorEncoding
 _OWN_STARTS = ("mpegts", "mpeg", "hls", "ogg")
 _STREAM_START = r", start (-?[\d.]+)"
 _FIRST_FRAME = r"n: *0 .*?pts_time:(\S+).*? s:(\d+)x(\d+)"
+# Containers whose files may be joined byte by byte; seconds by which that makes them longer.
+_JOINABLE, _JOINED_SECONDS = ("mpegts", "mpeg"), 1.0
 # Containers whose duration counts from time 0 instead of from the file's start.
 _DURATION_IS_END = ("matroska,webm", "flv")
 # Demuxers of streams without a container, besides those whose names end in "_pipe".
@@ -101,6 +103,8 @@ class VideoInfo:
     stream: int = 0  # ffmpeg's number of the video stream
     other_streams: str = ""  # the other video streams, such as "0 (320x180)"
     rate_stated: bool = True  # whether the file states its frame rate
+    times_restart: bool = False  # whether it can only be read from its beginning, see `joined_length`
+    other_index: bool = False  # whether another MP4 file follows in it, which ffmpeg does not read
 
     @property
     def has_audio(self) -> bool:
@@ -176,6 +180,7 @@ def _probe(path: Path | str, chosen: int | None) -> VideoInfo:
         audio_codec=audio_codec,
         audio_format=() if audio_codec is None else (audio_index, audio_codec, *sound),
         stream=index,
+        other_index="duplicated MOOV" in header,
         other_streams=", ".join(f"{each} ({size})" for each, size in streams.items() if each != index),
     )
     return _rate_of_raw(path, info) if info.is_raw else info
@@ -294,6 +299,16 @@ def _frame_times(path: Path | str, stream: int) -> list[float]:
     unit = re.search(r"^#tb 0: (\d+)/(\d+)", listing, re.MULTILINE)
     ticks = re.findall(r"^0, +-?\d+, +(-?\d+),", listing, re.MULTILINE)
     return sorted(int(tick) * int(unit[1]) / int(unit[2]) for tick in ticks) if unit else []
+
+
+def joined_length(path: Path, info: VideoInfo) -> float:
+    """Length in seconds of recordings that were joined byte by byte, whose times begin again; otherwise 0.
+
+    ffmpeg reads them one after the other, but jumps into any of them, and states the length of the last one.
+    """
+    times = _frame_times(path, info.stream) if info.container in _JOINABLE else []
+    length = times[-1] + float(1 / info.fps) if times else 0.0
+    return length if length > info.duration + _JOINED_SECONDS else 0.0
 
 
 def _rate_of_times(rate: Fraction, times: Sequence[float]) -> tuple[Fraction, bool]:

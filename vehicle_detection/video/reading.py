@@ -117,6 +117,11 @@ class FrameReader(Reader):
         self._strict, self._whole = strict, whole
         self._killed = False
         self._path, self._first, self._count = path, first, count
+        if first and info.times_restart:
+            raise VideoError(
+                f"{source_name(path)} cannot be read from {float(first / info.fps):g} s on: its times begin "
+                "again, as in joined files; copy it first, without loss: ffmpeg -i IN -c copy OUT.mkv"
+            )
         # All frames get the probed size: a stream may change its size, and pixels may not be square.
         filters = [f"scale={info.width}:{info.height}:flags=bicubic"]
         early = _EARLY
@@ -276,14 +281,17 @@ def find_damage(path: Path | str, info: VideoInfo, end: int, log: str, *, stop: 
 
 
 def _decode_errors(log: str) -> tuple[int, str]:
-    """Count the decoder's errors, and return the last one; the demuxer's concern other streams, too."""
+    """Count the decoder's errors, and return the last one.
+
+    The demuxer's errors concern other streams, too, and those of the output only times of frames.
+    """
     count, last, counted = 0, "", False
     for line in log.splitlines():
         repeated = _REPEATED.search(line)
         if repeated:
             count += int(repeated[1]) if counted else 0
             continue
-        counted = line.startswith("[") and not line.startswith("[in#")
+        counted = line.startswith("[") and not line.startswith(("[in#", "[rawvideo @"))
         if counted:
             count, last = count + 1, line
     return count, last_line(last)
