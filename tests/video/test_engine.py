@@ -101,11 +101,12 @@ def test_a_source_that_is_opened_already(clip, detector):
 
 
 def test_a_detector_may_be_a_model(clip):
-    results = track(clip, "highway", end=0.08)
-    assert [result.frame for result in results] == [None, None]
+    assert [result.frame for result in track(clip, "highway", end=0.08)] == [None, None]
 
 
-def test_results_without_frames_cannot_be_written(clip, detector, tmp_path):
+def test_what_cannot_be_written(clip, detector, tmp_path):
     for results in (iter([]), track(clip, detector)):
         with pytest.raises(InvalidInputError, match=r"results must .*; pass .*frames=True"):
             write_video(results, tmp_path / "out.mp4", detector.annotator)
+    with pytest.raises(InvalidInputError, match=r"annotator must have .*; pass an Annotator"):
+        write_video(track(clip, detector, frames=True), tmp_path / "out.mp4", None)

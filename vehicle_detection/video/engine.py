@@ -557,6 +557,6 @@ def _open_detector(detector: object) -> Iterator[Any]:
         if not callable(getattr(detector, method, None)):
             raise InvalidInputError(
                 f"detector must have the methods search, track and reset, got {describe(detector)} without "
-                f"{method}; pass a VehicleDetector()"
+                f"{method}; pass a VehicleDetector(), or detector_from(function)"
             )
     yield detector

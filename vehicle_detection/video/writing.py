@@ -381,6 +381,9 @@ class _Drawing:
     def __init__(self, annotator: VideoAnnotator, results: TrackRun) -> None:
         if not results.has_frames:
             raise InvalidInputError("results must hold their frames; pass frames=True to track")
+        if not all(hasattr(annotator, name) for name in ("draw", "output_shape", "reset")):
+            must = "have the methods draw, output_shape and reset"
+            raise invalid("annotator", must, annotator, "pass an Annotator, such as detector.annotator")
         annotator.reset(fps=float(results.info.fps))
         self._annotator, self._expected, self.seconds = annotator, -1, 0.0
         self._shape = annotator.output_shape(results.info.shape)
