@@ -201,13 +201,14 @@ def detector_from(
     ----------
     function
         Called with an ``(H, W, 3)`` uint8 RGB image of its own. It returns ``(boxes, scores)``, ``(N, 4)``
-        ``[x1, y1, x2, y2]`` in pixels and ``(N,)``, or ``(boxes, scores, classes)``; or `Detections`, or an
-        object with ``xyxy`` (see `Detections.from_supervision`). Boxes are clipped to the image. It should
-        return weak boxes as well: the tracker uses them, images show only those above the threshold.
+        ``[x1, y1, x2, y2]`` in pixels and ``(N,)``, or ``(boxes, scores, classes)`` with numbers of classes;
+        or `Detections`, which may have names of classes, ``labels``; or an object with ``xyxy`` (see
+        `Detections.from_supervision`). Boxes are clipped to the image. It should return weak boxes as well:
+        the tracker uses them, images show only those above the threshold.
     score
-        What the scores are. They are converted to log-odds above the threshold, the unit of `TrackParams`:
-        ``"probability"``, 0 to 1; ``"logit"``, log-odds; ``(low, high)``, any scale, of which `low` is the
-        threshold and becomes 0, and `high`, a certain vehicle, becomes 3 (95%).
+        What the scores are, also those of `Detections`. They are converted to log-odds above the threshold,
+        the unit of `TrackParams`: ``"probability"``, 0 to 1; ``"logit"``, log-odds; ``(low, high)``, any
+        scale, of which `low` is the threshold and becomes 0, and `high`, a certain vehicle, becomes 3 (95%).
     threshold
         Score from which a box is a vehicle in a single image: by default 0.5 for probabilities and 0 for
         log-odds. Pass 0.25 if that is the usual threshold of your detector.
