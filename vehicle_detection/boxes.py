@@ -405,6 +405,11 @@ def logit(probability: float) -> float:
     return math.log(probability / (1 - probability))
 
 
+def confidence_score(confidence: float) -> float:
+    """Return the log-odds of a confidence from 0 to 1, whose ends have no finite ones."""
+    return logit(min(max(confidence, 1e-6), 1 - 1e-6))
+
+
 def log_odds(scores: ArrayLike, score: ScoreScale, threshold: float | None = None) -> Floats:
     """Convert the scores of another detector to log-odds above its threshold, ``(N,)`` float64.
 

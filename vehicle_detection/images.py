@@ -195,7 +195,7 @@ def _has_several(data: bytes) -> bool:
 def _is_deep(data: bytes) -> bool:
     """Whether a PNG or TIFF file has 16 bits for each value."""
     if _TIFF.match(data):
-        return max(np.atleast_1d(_tiff_tags(data).get(258, 1))) == 16
+        return bool(np.max(_tiff_tags(data).get(258, 1)) == 16)
     return data.startswith(b"\x89PNG") and data[24] == 16
 
 

@@ -17,12 +17,12 @@ from vehicle_detection._common import (
     check,
     invalid,
     is_listing,
-    name_vehicles,
     natural_key,
     pluralize,
     shorten,
-)
-from vehicle_detection.boxes import TABLE_COLUMNS, Detections
+    warn_of_vehicles,
+)  # fmt: skip
+from vehicle_detection.boxes import TABLE_COLUMNS, Detections, confidence_score
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.tracking import TRACK_VALUES, UNKNOWN_LABEL, is_result, shown_tracks
 
@@ -471,6 +471,7 @@ def parse_cells(
         found = shorten(", ".join(map(str, cells)), 300) or "an empty file"
         raise DatasetError(f"{source} lacks the columns {', '.join(missing)}; found {found}")
     keys = _parse_frames(cells["frame"], places)
+    cells = _with_scores(cells, places)
     scores = cells.get("score")
     predicted = scores is not None and (not scores or not all(map(_is_missing, scores)))
     vehicles, lookalike, labels = _vehicle_rows(cells, source, classes, predicted)
@@ -487,6 +488,15 @@ def parse_cells(
         columns["ignore"] = columns.get("ignore", False) | lookalike[rows]
     columns["boxes"] = np.stack([columns.pop(name) for name in CORNERS], axis=1)
     return {"frame": [keys[row] for row in rows], "frame_keys": keys, **columns}, where
+
+
+def _with_scores(cells: Mapping[str, Sequence[Any]], places: Sequence[str]) -> Mapping[str, Sequence[Any]]:
+    """Add the log-odds of confidences as scores if a table has no others: such boxes are no labels."""
+    confidences = cells.get("confidence", cells.get("conf", ()))
+    if not all(map(_is_missing, cells.get("score", ()))) or all(map(_is_missing, confidences)):
+        return cells
+    known = _parse_numbers("confidence", confidences, places).tolist()
+    return {**cells, "confidence": confidences, "score": list(map(confidence_score, known))}
 
 
 def _is_missing(cell: Any) -> bool:
@@ -528,10 +538,8 @@ def _vehicle_rows(
     if not known or (classes is None and any(cells.keys() >= own for own in _OWN_COLUMNS)):
         others = found - {*VEHICLE_CLASSES, *LOOKALIKE_CLASSES}
         if known and others and "score" not in cells:
-            listed = shorten(", ".join(sorted(others)))
-            _LOGGER.warning(
-                "%s: boxes of class %s are read as vehicles; classes= selects some", source, listed
-            )
+            text = "%s: boxes of class %s are read as vehicles; classes= selects some"
+            _LOGGER.warning(text, source, shorten(", ".join(sorted(others))))
         return np.ones(count, np.bool_), np.zeros(count, np.bool_), names if known else None
     wanted = VEHICLE_CLASSES if classes is None else classes
     check_classes(source, found, wanted)
@@ -546,16 +554,10 @@ def check_classes(
     """Refuse a file in which no class is that of vehicles: it would have no box. Warn of similar classes."""
     if not any(name in wanted for name in found):
         listed = shorten(", ".join(map(repr, sorted(found))), 300) or "none"
-        names = ", ".join(sorted(wanted))
-        remedy = "name those of vehicles with classes="
-        raise DatasetError(f"{source} has no {kind} among {names}; found {listed}; {remedy}")
-    others = sorted({*name_vehicles(found)} - {*wanted, *LOOKALIKE_CLASSES})
-    if wanted is VEHICLE_CLASSES and others:
-        _LOGGER.warning(
-            "%s: vehicles of class %s are left out; classes= selects all classes of vehicles",
-            source,
-            shorten(", ".join(others)),
-        )
+        must = f"has no {kind} among {', '.join(sorted(wanted))}"
+        raise DatasetError(f"{source} {must}; found {listed}; name those of vehicles with classes=")
+    if wanted is VEHICLE_CLASSES:
+        warn_of_vehicles(str(source), found, {*wanted, *LOOKALIKE_CLASSES})
 
 
 def parse_number(cell: Any, name: str, place: str) -> float:

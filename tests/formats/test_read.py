@@ -76,6 +76,16 @@ def test_csv_of_predictions(tmp_path):
     assert len(read_labels(written(tmp_path, header))) == 0
 
 
+@pytest.mark.parametrize("name", ["confidence", "conf"])
+def test_a_confidence_is_a_score_where_there_is_no_other(tmp_path, name):
+    text = f"frame,track_id,x1,y1,x2,y2,{name}\n0,1,0,0,9,9,0.5\n0,2,0,0,9,9,1\n"
+    found = read_labels(written(tmp_path, text))
+    np.testing.assert_allclose(found["score"], [0, 13.8], atol=0.1)
+    assert found["confidence"].tolist() == [0.5, 1]
+    with pytest.raises(DatasetError, match="line 4: some boxes have a score and some have none"):
+        read_labels(written(tmp_path, f"{text}0,3,0,0,9,9,\n"))
+
+
 @pytest.mark.parametrize("name", ["track", "track_id"])
 def test_csv_labels_need_only_frames_tracks_and_boxes(tmp_path, name):
     labels = read_labels(written(tmp_path, f"frame,{name},x1,y1,x2,y2\n0,1,0,0,9,9\n1,1,1,0,9,9\n"))
@@ -118,6 +128,13 @@ def test_csv_labels_need_only_frames_tracks_and_boxes(tmp_path, name):
 def test_invalid_csv_files(tmp_path, text, message):
     with pytest.raises(DatasetError, match=message):
         read_labels(written(tmp_path, text))
+
+
+def test_a_vehicle_that_is_labelled_twice_is_mentioned(tmp_path, caplog):
+    read_labels(written(tmp_path, CSV.replace("\n2,", "\n0,-1,0,370,601.5,476,0,0,1\n2,")))
+    assert not caplog.text
+    assert len(read_labels(written(tmp_path, f"{CSV}2,-1,5,6,70,80,0,0,0\n"))) == 4
+    assert "copies of other boxes of their frames: 1, the first at" in caplog.text
 
 
 def test_boxes_are_clipped_to_the_shape(tmp_path):
@@ -240,8 +257,9 @@ def test_invalid_files_of_other_formats(tmp_path, name, text, message):
 def test_invalid_paths(tmp_path):
     with pytest.raises(DatasetError, match="does not exist; check the path"):
         read_labels(tmp_path / "none.csv")
-    with pytest.raises(DatasetError, match=r"holds no \.txt file"):
-        read_labels(tmp_path)
+    for options, kind in (({}, "KITTI"), ({"format": "yolo", "shape": (9, 9)}, "folder of YOLO")):
+        with pytest.raises(DatasetError, match=rf"holds no \.txt file; name a {kind} label"):
+            read_labels(tmp_path, **options)
     with pytest.raises(DatasetError, match="is a folder, and csv labels are one file"):
         read_labels(tmp_path, format="csv")
 
@@ -437,16 +455,13 @@ def test_invalid_yolo_files(tmp_path, line, message):
         read_labels(tmp_path, format="yolo", shape=(100, 200))
     with pytest.raises(InvalidInputError, match=r"shape must be \(height, width\) of the frames .* images="):
         read_labels(tmp_path, format="yolo")
-    (tmp_path / "a.txt").unlink()
-    with pytest.raises(DatasetError, match=r"holds no \.txt file; name a folder of YOLO labels"):
-        read_labels(tmp_path, format="yolo", shape=(100, 200))
 
 
 @pytest.mark.parametrize(
     ("names", "text", "known"),
     [
         ("data.yaml", "names:\n  0: person\n  2: car  # sedans\n  7: truck\nnc: 8\n", True),
-        ("data.yaml", "names: {0: person, 2: 'Car', 7: truck}\n", True),
+        ("dataset.yaml", "names: {0: person, 2: 'Car', 7: truck}\n", True),
         ("data.yaml", '{"names": {"0": "person", "2": "car", "7": "bus"}}', True),
         ("data.yaml", "names:\n  0: person\n  2: car\n  7: van\nextra:\n  0: car\n", True),
         ("data.yaml", "names: [person, x,\n car, x, x, x, x, truck]", True),

@@ -43,6 +43,7 @@ MOT_LABELS = {
 }
 MOT_RESULTS = {
     "MOT": "1,1,11,21,30,40,0.9\n1,2,11,21,30,40,0.2",
+    "numpy.savetxt": "1.0e+00 1.0e+00 1.1e+01 2.1e+01 3e+01 4e+01 9e-01\n1e+00 2e+00 11 21 3e+01 4e+01 2e-01",
     "eight": "1,1,11,21,30,40,0.9,2\n1,2,11,21,30,40,0.2,2",
     "BoxMOT": "1,1,11,21,30,40,0.9,2,-1\n1,2,11,21,30,40,0.2,2,-1",
     "TrackEval": "1,1,11,21,30,40,0.9,-1,-1,-1\n1,2,11,21,30,40,0.2,-1,-1,-1",
@@ -90,13 +91,17 @@ def test_yolo_of_cvat(tmp_path):
     folder = tmp_path / "obj_train_data"
     folder.mkdir()
     (tmp_path / "obj.names").write_text("person\r\ncar\r\n")
-    (tmp_path / "train.txt").write_text("a.jpg")
+    for name in ("train.txt", "obj_train_data/val.txt"):
+        (tmp_path / name).write_text("./data/a.jpg\n")
     (folder / "frame_000000.txt").write_text("1 0.5 0.5 0.2 0.4\n0 0.5 0.5 0.1 0.1\n")
     (folder / "frame_000001.txt").write_text("")
     for path in (tmp_path, folder):
         table = read_labels(path, shape=(100, 200))
         assert table.boxes.tolist() == [[80, 30, 120, 70]]
         assert table.frame_keys == ("frame_000000", "frame_000001")
+    (folder / "frame_000001.txt").write_text("2 .5 .5 .2 .2")
+    with pytest.raises(DatasetError, match="line 1: class 2 has no name"):
+        read_labels(folder, shape=(100, 200))
 
 
 @pytest.mark.parametrize(
@@ -117,13 +122,6 @@ def test_classes_that_are_numbers_are_read_with_a_warning(name, text, tmp_path, 
     caplog.clear()
     assert len(read_labels(source, shape=(100, 200), classes=["0"])) == 1
     assert not caplog.text
-
-
-def test_a_class_without_a_name_is_an_error(tmp_path):
-    (tmp_path / "classes.txt").write_text("car\nbus")
-    (tmp_path / "a.txt").write_text("2 .5 .5 .2 .2")
-    with pytest.raises(DatasetError, match="line 1: class 2 has no name"):
-        read_labels(tmp_path, format="yolo", shape=(100, 200))
 
 
 @pytest.mark.parametrize(

@@ -270,6 +270,7 @@ def test_an_error_in_the_results_leaves_the_earlier_file(tmp_path, name):
         (RESULTS, {"path": "t.xlsx"}, r"path must end in .csv, .*, got 't.xlsx'; or set the format to 'csv'"),
         (7, {}, "results must be a list of FrameResult, got 7"),
         (pd.DataFrame({"frame": [0]}), {}, "TrackTable.from_pandas"),
+        (TrackTable(["a"], None, [[0, 0, 9, 9]]), {"fps": 25}, "fps must be omitted for frames with names"),
         (RESULTS, {"path": "yolo", "format": "yolo"}, r"shape must be \(height, width\)"),
         (RESULTS, {"path": "f", "format": "yolo", "shape": (9, 9)}, "path must be a new or empty folder"),
     ],
@@ -290,9 +291,3 @@ def test_a_missing_pyarrow_is_reported_before_the_video(tmp_path, monkeypatch):
     ):
         pass
     assert os.listdir(tmp_path) == []
-
-
-def test_frames_with_names_have_no_times(tmp_path):
-    table = TrackTable(["a.jpg"], [1], [[0, 0, 9, 9]], score=[1.0])
-    with pytest.raises(InvalidInputError, match="fps must be omitted for frames with names"):
-        write_tracks(table, tmp_path / "boxes.csv", fps=25)

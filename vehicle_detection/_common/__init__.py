@@ -26,12 +26,12 @@ from vehicle_detection._common.text import (
     is_url,
     is_web_address,
     local_path,
-    name_vehicles,
     natural_key,
     parse_yaml,
     pluralize,
     spreadsheet_text,
     stable_url,
+    warn_of_vehicles,
     without_query,
 )
 from vehicle_detection._common.threads import (

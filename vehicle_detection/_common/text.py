@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterable
 from typing import Any
 from urllib.parse import unquote_plus
+
+_LOGGER = logging.getLogger(__name__)
 
 _URL = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://")
 _FILE_URL = re.compile("file://(localhost(?=/))?", re.IGNORECASE)
@@ -41,14 +44,18 @@ _VEHICLE = re.compile(
 )
 
 
-def name_vehicles(names: Iterable[str]) -> list[str]:
-    """Select the names of classes that seem to be vehicles by their last word: "big truck", "cars", "bus-l".
-
-    >>> name_vehicles(["Fire_Truck", "truck-xl-", "car wheel", "person"])
-    ['Fire_Truck', 'truck-xl-']
-    """
-    words = {name: [word for word in re.split("[^a-z]+", name.lower()) if len(word) > 2] for name in names}
-    return [name for name, each in words.items() if each and _VEHICLE.fullmatch(each[-1])]
+def warn_of_vehicles(source: str, found: Iterable[str], read: Iterable[str]) -> None:
+    """Warn of classes that are not read, but seem to be vehicles by their last word: "big truck", "bus-l"."""
+    words = {
+        name: [word for word in re.split("[^a-z]+", name) if len(word) > 2] for name in {*found} - {*read}
+    }
+    others = sorted(name for name, each in words.items() if each and _VEHICLE.fullmatch(each[-1]))
+    if others:
+        _LOGGER.warning(
+            "%s: vehicles of class %s are left out; classes= selects all classes of vehicles",
+            source,
+            ", ".join(others[:9]),
+        )
 
 
 def parse_yaml(text: str) -> Any:

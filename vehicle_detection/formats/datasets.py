@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vehicle_detection._common import Limit, check, describe, invalid, parse_yaml, read_regular_file
-from vehicle_detection.boxes import clip_boxes, logit
+from vehicle_detection.boxes import clip_boxes, confidence_score
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.formats.rows import (
@@ -21,6 +21,7 @@ from vehicle_detection.formats.rows import (
     FileRows,
     Record,
     class_name,
+    label_files,
     no_text_files,
     read_lines,
     read_text,
@@ -284,8 +285,6 @@ def open_coco_results(part: Path, truth: Truth) -> Iterator[Write]:
     part.write_text(json.dumps(results, ensure_ascii=False), encoding="utf-8", newline="\n")
 
 
-# Confidences of 0 and 1 have infinite log-odds.
-_MIN_CONFIDENCE = 1e-6
 _TRACKS_ALONE = "tracks without confidences; write those too (save_conf=True of Ultralytics)"
 
 
@@ -298,7 +297,7 @@ def read_yolo(source: Path, classes: Collection[str] | None, shape: Any, images:
     if len(inner) > 1:
         raise DatasetError(f"{source} holds {inner[0].name} and {inner[1].name}; name one of them")
     folder = inner[0] if inner else source
-    files = [file for file in folder.glob("*.txt") if file.name not in ("classes.txt", "train.txt")]
+    files = label_files(folder)
     without_frames = folder != source and not any(folder.iterdir())
     if not files and not without_frames:
         raise no_text_files(folder, "a folder of YOLO labels")
@@ -373,7 +372,7 @@ def _yolo_record(where: str, words: list[str], shape: tuple[int, ...]) -> tuple[
         if not 0 <= confidence <= 1:
             got = f"got {describe(words[5])}; it may be one of {_TRACKS_ALONE}"
             raise DatasetError(f"{where}: confidence must be from 0 to 1, {got}")
-        record["score"] = logit(min(max(confidence, _MIN_CONFIDENCE), 1 - _MIN_CONFIDENCE))
+        record["score"] = confidence_score(confidence)
         record["track_id"] = parse_number(words[6], "track", where) if len(words) > 6 else None
     if not FRAME_NUMBER.fullmatch(words[0]):
         raise DatasetError(f"{where}: class must be a whole number, got {describe(words[0])}")
@@ -381,11 +380,12 @@ def _yolo_record(where: str, words: list[str], shape: tuple[int, ...]) -> tuple[
 
 
 def _yolo_names(source: Path) -> dict[str, str]:
-    """Lower-case name of each class number, from ``data.yaml`` or a list of names; empty if unknown."""
+    """Lower-case name of each class number, from a YAML file or a list of names; empty if unknown."""
     place = source.resolve()
     for folder in (place, *place.parents[:2]):
-        if (folder / "data.yaml").is_file():
-            return _yaml_names(folder / "data.yaml")
+        for described in ("data.yaml", "dataset.yaml"):  # the latter of FiftyOne
+            if (folder / described).is_file():
+                return _yaml_names(folder / described)
         for listed in ("classes.txt", "obj.names"):
             if (folder / listed).is_file():
                 lines = read_text(folder / listed).splitlines()

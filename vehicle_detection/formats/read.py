@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import logging
 import os
 import re
 import zipfile
@@ -27,6 +28,7 @@ from vehicle_detection.formats.rows import (
     FRAME_NUMBER,
     FileRows,
     Record,
+    label_files,
     no_text_files,
     read_lines,
     read_text,
@@ -57,6 +59,8 @@ FOLDER_FORMATS = ("kitti", "yolo")
 """Formats that are folders, which are named instead of chosen by a suffix."""
 
 PERSON_CLASSES = ("pedestrian", "person_sitting", "cyclist")
+
+_LOGGER = logging.getLogger(__name__)
 
 _LABELS = ("frame", "track", *CORNERS)
 # The project's labels do not score vehicles that are largely hidden, truncated by more, or narrower (px).
@@ -138,7 +142,7 @@ def _read_parquet(source: Path, classes: Collection[str] | None) -> FileRows:
 
 
 def _read_kitti(source: Path, classes: Collection[str] | None) -> FileRows:
-    files = list(source.glob("*.txt")) if source.is_dir() else [source]
+    files = label_files(source) if source.is_dir() else [source]
     if not files:
         raise no_text_files(source, "a KITTI label_2 folder or a label file")
     rows: list[tuple[str, Record]] = []
@@ -219,7 +223,7 @@ def _mot_rows(
             record["ignore"] = values[0] == 0
         else:
             record["score"] = values[0] if values else None
-        yield where, record, words[7] if len(words) in (8, 9) and words[7] != "-1" else None
+        yield where, record, f"{values[1]:g}" if len(words) in (8, 9) and values[1] != -1 else None
 
 
 def _is_mot_label(words: list[str]) -> bool:
@@ -306,13 +310,14 @@ def read_labels(
         - a CSV file, separated by commas, semicolons or tabs: for labels
           ``frame,track,x1,y1,x2,y2[,occluded,truncated,ignore]``, where ``track_id`` may stand for ``track``,
           for predictions the columns of `write_tracks`; with a column ``class``, ``label`` or ``category`` of
-          names, rows of other classes than vehicles are left out;
+          names, rows of other classes than vehicles are left out; a column ``confidence`` or ``conf`` stands
+          for a missing ``score``, as its log-odds;
         - a JSON Lines or Parquet (needs pyarrow) file with these columns;
         - a KITTI ``label_2`` folder or one of its files, or a file of KITTI's tracking;
         - a MOTChallenge text file, or the MOT archive of CVAT;
         - a COCO JSON file, or a list of COCO results;
-        - a YOLO folder: ``labels/*.txt``, with names in ``data.yaml`` or ``classes.txt``, or an unpacked
-          YOLO archive of CVAT.
+        - a YOLO folder: ``labels/*.txt``, with names in ``data.yaml``, ``dataset.yaml`` or ``classes.txt``,
+          or an unpacked YOLO archive of CVAT.
     format
         ``"csv"``, ``"jsonl"``, ``"parquet"``, ``"kitti"``, ``"mot"``, ``"mot_zip"``, ``"coco"``,
         ``"coco_results"`` or ``"yolo"``; None chooses by suffix and content.
@@ -404,6 +409,8 @@ def _table_of(
             if before != place:
                 twice = f"track {track} comes twice in frame {describe(frame)}"
                 raise DatasetError(f"{place}: {twice}, first at {before}")
+    if labelled:
+        _warn_of_copies(source, columns, places)
     if shape is not None:
         columns["boxes"] = clip_boxes(boxes, shape)
         gone = np.flatnonzero((columns["boxes"][:, :2] == columns["boxes"][:, 2:]).any(axis=1))
@@ -412,6 +419,19 @@ def _table_of(
             remedy = "check that shape is (height, width) of these frames"
             raise DatasetError(f"{places[gone[0]]}: box {box} lies outside the {size} image; {remedy}")
     return TrackTable(**columns | {"frame_keys": (*columns["frame_keys"], *found.frames)})
+
+
+def _warn_of_copies(source: Path, columns: dict[str, Any], places: list[str]) -> None:
+    """Warn of vehicles that are labelled twice, as in merged exports: the copies would count as missed."""
+    ignored = columns.get("ignore", np.zeros(len(places), np.bool_))
+    seen, copies = set[tuple[Any, ...]](), list[str]()
+    for frame, box, is_ignored, place in zip(columns["frame"], columns["boxes"].tolist(), ignored, places):
+        if (frame, *box) in seen and not is_ignored:
+            copies.append(place)
+        seen.add((frame, *box))
+    if copies:
+        text = "%s holds copies of other boxes of their frames: %d, the first at %s; remove them"
+        _LOGGER.warning(text, source, len(copies), copies[0])
 
 
 def _guess_format(source: Path) -> str:
@@ -424,7 +444,7 @@ def _guess_format(source: Path) -> str:
             if any(source.glob(f"*{suffix}")) and not any(source.glob("*.txt")):
                 reason = f"holds {suffix} files, as of {tool}, which are not read"
                 raise DatasetError(f"{source} {reason}; export one COCO file")
-        lines = (line for file in source.glob("*.txt") for _, line in read_lines(file))
+        lines = (line for file in label_files(source) for _, line in read_lines(file))
         words = next(lines, "").split()
         outlines = len(words) > 8 and not any(word.isalpha() for word in words)  # of YOLO
         return "yolo" if 5 <= len(words) <= 7 or outlines else "kitti"
@@ -442,6 +462,6 @@ def _guess_format(source: Path) -> str:
         raise DatasetError(f"{source} is XML, as of CVAT or Pascal VOC, which is not read; {remedy}")
     if len(words) in (17, 18) and words[2].isalpha():
         return "kitti"
-    if not words or re.fullmatch(r"[0-9]+(\.0*)?", words[0]):
+    if not words or re.fullmatch(r"[0-9]+(\.0*|\.[0-9]+e\+[0-9]+)?", words[0]):  # also of numpy.savetxt
         return "mot"
     return "kitti" if len(words) >= 15 and "frame" not in words else "csv"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import Any, NamedTuple
 
 from vehicle_detection._common import Limit, read_regular_file, shorten
@@ -18,6 +18,9 @@ _LOGGER = logging.getLogger(__name__)
 
 Record = dict[str, Any]
 """Values of a row by the names of their columns, None where a value is unknown."""
+
+# Names of lists of images beside the labels, as of CVAT, FiftyOne and Darknet; a frame may have one of them.
+_LISTS = ("train", "val", "valid", "test", "images")
 
 FRAME_NUMBER = re.compile(r"-?(0|[1-9][0-9]{0,17})(\.0*)?")
 """Text of a frame that is a number. One with leading zeros is a file name."""
@@ -94,8 +97,20 @@ def warn_of_numbers(source: Path, numbers: Collection[str], remedy: str) -> None
         _LOGGER.warning("%s: all classes (%s) are read as vehicles; %s", source, shorten(listed), remedy)
 
 
+def label_files(folder: Path) -> list[Path]:
+    """Text files of a folder that hold labels, not names of classes, lists of images or a README."""
+    return [
+        file
+        for file in folder.glob("*.txt")
+        if file.name != "classes.txt"
+        and not file.name.startswith("README")
+        and not (file.stem in _LISTS and all(is_image(PurePath(line).name) for _, line in read_lines(file)))
+    ]
+
+
 def no_text_files(folder: Path, expected: str) -> DatasetError:
     """Error of a folder without text files, which names a subfolder that has some, such as labels/train."""
-    inside = min((file.parent for file in folder.glob("*/*.txt")), default=None)
+    texts = (*folder.glob("*/*.txt"), *folder.glob("*/labels/*.txt"))
+    inside = min((file.parent for file in texts), default=None)
     remedy = f"name {expected}" if inside is None else f"its subfolders are read one at a time: name {inside}"
     return DatasetError(f"{folder} holds no .txt file; {remedy}")

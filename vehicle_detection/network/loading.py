@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import logging
 import os
 from collections.abc import Collection
 from importlib import resources
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Limit, check, invalid, name_vehicles, read_regular_file
+from vehicle_detection._common import Limit, check, invalid, read_regular_file, warn_of_vehicles
 from vehicle_detection.boxes import logit
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.network.model import INPUT_SIZE, NetworkModel, NetworkParams
@@ -34,8 +33,6 @@ from vehicle_detection.network.tensors import (
     recognize,
     usual_names,
 )
-
-_LOGGER = logging.getLogger(__name__)
 
 METADATA_KEY = "vehicle_detection"
 """Key of the ONNX metadata with the parameters of a network of this library, as JSON."""
@@ -225,19 +222,13 @@ def _class_ids(
         numbers.setdefault(text.strip().lower(), []).append(key)
     if classes is None:
         ids = [number for text in VEHICLE_CLASSES for number in numbers.get(text, ())]
-        others = sorted({*name_vehicles(numbers)} - {*VEHICLE_CLASSES})
-        if ids and others:
-            _LOGGER.warning(
-                "%s: vehicles of class %s are left out; classes= selects all classes of vehicles",
-                name,
-                ", ".join(others),
-            )
         if known and not ids:
             listed = ", ".join(known.values())
             raise InvalidInputError(
                 f"classes must be given for {name}, which has none of {', '.join(VEHICLE_CLASSES)}; name "
                 f"those of its classes that are vehicles: {listed}"
             )
+        warn_of_vehicles(name, numbers, VEHICLE_CLASSES)
         return np.array(sorted(ids), np.intp) if known else None
     ids = []
     count = model.output_format.n_classes or 1 << 31
