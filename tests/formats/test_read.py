@@ -19,8 +19,6 @@ from vehicle_detection import (
 )
 
 HEADER = "frame,track,x1,y1,x2,y2,occluded,truncated,ignore"
-
-
 CSV = f"{HEADER}\n0,-1,0,370,601.5,476,0,0,1\n0,-1,600,390,841,441,0,0,1\n2,1,5,6,70,80,1,0.25,0\n"
 
 
@@ -135,6 +133,8 @@ def test_a_vehicle_that_is_labelled_twice_is_mentioned(tmp_path, caplog):
     assert not caplog.text
     assert len(read_labels(written(tmp_path, f"{CSV}2,-1,5,6,70,80,0,0,0\n"))) == 4
     assert "copies of other boxes of their frames: 1, the first at" in caplog.text
+    read_labels(written(tmp_path, f"{HEADER}\n0,1,0.1,0.5,0.2,1,0,0,0\n"))
+    assert "all boxes are within 1 pixel, as fractions of the frame are" in caplog.text
 
 
 def test_boxes_are_clipped_to_the_shape(tmp_path):

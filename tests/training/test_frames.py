@@ -50,10 +50,13 @@ def test_labels_of_coco(tmp_path, caplog):
     table = tmp_path / "labels" / "town.csv"
     labels = read_labels(table)
     table.unlink()
-    write_labels(labels.renamed(lambda name: f"town/{name}"), tmp_path / "labels" / "town.json")
-    (source,) = find_sources(tmp_path)
-    assert len(source.sets[0].labels) == len(frames.labels)
-    assert caplog.text == ""
+    for shape in (None, frames[0].shape, (9, 16)):
+        assert caplog.text == ""
+        named = labels.renamed(lambda name: f"town/{name}")
+        write_labels(named, tmp_path / "labels" / "town.json", shape=shape)
+        (source,) = find_sources(tmp_path)
+        assert len(source.sets[0].labels) == len(frames.labels)
+    assert "3 of 3 images have another size than it states, such as " in caplog.text
     write_labels(labels, table)
     with pytest.raises(DatasetError, match=r"town\.csv and \S.*town\.json label the same frames"):
         find_sources(tmp_path)
@@ -118,14 +121,6 @@ def test_the_longer_side_of_frames_is_limited(height, width):
         load_training_frames([source], max_side=0)
 
 
-def test_labels_without_an_image_are_reported(tmp_path, caplog):
-    write_source(tmp_path, "road", 2, ["1.png,1,10,10,60,50\n", "none.png,1,10,10,60,50\n"])
-    (source,) = find_sources(tmp_path)
-    assert len(source.sets[0].labels) == 1
-    assert "1 of 2 labelled frames have no image in" in caplog.text
-    assert "such as 'none.png'; they are left out" in caplog.text
-
-
 @pytest.mark.parametrize(
     ("labelled", "chosen"),
     [
@@ -145,7 +140,9 @@ def test_frames_of_videos_that_are_labelled_in_part(tmp_path, labelled, chosen):
     assert list(source.sets[0].keys) == chosen
 
 
-def test_images_whose_labels_have_other_names_are_not_empty_frames(tmp_path):
+def test_images_whose_labels_have_other_names_are_not_empty_frames(tmp_path, caplog):
     write_source(tmp_path, "road", 3, ["in\\1.png,1,10,10,60,50\n", "2_png.rf.7a.png,1,10,10,60,50\n"])
     (source,) = find_sources(tmp_path)
     assert set(source.sets[0].keys) == set(source.sets[0].labels["frame"].tolist()) == {"1.png"}
+    assert "1 of 2 labelled frames have no image in" in caplog.text
+    assert "such as '2_png.rf.7a.png'; they are left out" in caplog.text

@@ -160,7 +160,7 @@ def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None
         return None
     if frames is None or labels is None:
         raise InvalidInputError("--frames and --labels belong together; give both")
-    name, true = frames.name or "frames", vd.read_labels(labels)
+    name, true = frames.name or "frames", vd.read_labels(labels, images=frames)
     return vd.LabelledFrames(name, vd.load_frames(frames), true, horizon)
 
 

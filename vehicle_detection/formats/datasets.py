@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,6 +43,8 @@ from vehicle_detection.tables import (
     frame_order,
     parse_number,
 )
+
+_LOGGER = logging.getLogger(__name__)
 
 Write = Callable[[FrameKey, Sequence[Record]], None]
 """Writes rows of a frame, of which there may be none."""
@@ -129,10 +132,12 @@ def _vehicle_categories(file: CocoFile, source: Path, classes: Collection[str] |
 
 
 def read_coco(
-    source: Path, classes: Collection[str] | None, truth: Path | None
+    source: Path, classes: Collection[str] | None, truth: Path | None, images: FrameSet | None
 ) -> tuple[list[tuple[str, Record]], list[FrameKey]]:
     """Read the records of a data set or of results, each after its place, and the frames."""
     file = _read_file(source, truth)
+    if images is not None:
+        _warn_of_sizes(source, file, images)
     vehicles = _vehicle_categories(file, source, classes)
     rows: list[tuple[str, Record]] = []
     tracks = (_with_attributes(each).get("track_id") for each in file.annotations if isinstance(each, dict))
@@ -159,6 +164,23 @@ def read_coco(
         record |= {"frame": frame, "track_id": track, "ignore": ignore, "label": name}
         rows.append((where, record | dict(zip(CORNERS, (x, y, x + width, y + height)))))
     return rows, list(file.images.values())
+
+
+def _warn_of_sizes(source: Path, file: CocoFile, images: FrameSet) -> None:
+    """Warn if images have another size than the one on which their boxes were drawn."""
+    stated = {
+        str(key).replace("\\", "/").rpartition("/")[2]: (entry.get("width"), entry.get("height"))
+        for key, entry in zip(file.images.values(), file.entries)
+    }
+    known = [name for name in images.names if {*map(type, stated.get(name, ()))} == {int}]
+    sizes = {name: _image_shape(images.folder / name)[1::-1] for name in known}
+    other = [name for name in known if sizes[name] != stated[name]]
+    if other:
+        _LOGGER.warning(
+            "%s: %d of %d images have another size than it states, such as %s: %dx%d instead of %dx%d; boxes "
+            "are not scaled",
+            *(source, len(other), len(known), other[0], *sizes[other[0]], *stated[other[0]]),
+        )
 
 
 def _with_attributes(entry: dict[str, Any]) -> dict[str, Any]:
@@ -341,17 +363,21 @@ def _yolo_frames(files: Sequence[Path], shape: Any) -> list[tuple[FrameKey, tupl
 
 
 def _yolo_images(files: Sequence[Path], images: FrameSet) -> list[tuple[FrameKey, tuple[int, ...]]]:
-    """Name and shape of the image of each file; the header has the shape, unless EXIF data may rotate it."""
+    """Name and shape of the image of each file."""
     names = {without_suffix(name): name for name in images.names}
     frames: list[tuple[FrameKey, tuple[int, ...]]] = []
     for file in files:
         if file.stem not in names:
             raise DatasetError(f"{file} has no image in {images.folder}; pass the folder of its image")
-        image = images.folder / names[file.stem]
-        data = read_regular_file(image, f"image file {image}", Limit.IMAGE_BYTES, error=DatasetError)
-        size = None if b"exif" in data.lower() else image_size(data)
-        frames.append((image.name, read_image(image).shape[:2] if size is None else size[::-1]))
+        frames.append((names[file.stem], _image_shape(images.folder / names[file.stem])))
     return frames
+
+
+def _image_shape(image: Path) -> tuple[int, ...]:
+    """Height and width of an image file; the header has them, unless EXIF data may rotate it."""
+    data = read_regular_file(image, f"image file {image}", Limit.IMAGE_BYTES, error=DatasetError)
+    size = None if b"exif" in data.lower() else image_size(data)
+    return read_image(image).shape[:2] if size is None else size[::-1]
 
 
 def _yolo_record(where: str, words: list[str], shape: tuple[int, ...]) -> tuple[str, Record]:

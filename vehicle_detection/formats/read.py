@@ -330,7 +330,8 @@ def read_labels(
     truth
         The COCO data set whose image and category ids a list of COCO results has.
     images
-        The folder of the images of a YOLO folder, which may differ in size, instead of `shape`.
+        The folder of the images: of a YOLO folder, which may differ in size, instead of `shape`; of a COCO
+        file, whose sizes are compared.
 
     Returns
     -------
@@ -376,9 +377,8 @@ def read_labels(
     if classes is not None:
         chosen = frozenset(str(name).lower() for name in check.sequence(classes, "classes", "names"))
     if kind in ("coco", "coco_results"):  # told apart by their content
-        found = rows_of_records(
-            *read_coco(source, chosen, None if truth is None else check.path(truth, "truth"))
-        )
+        named = None if truth is None else check.path(truth, "truth")
+        found = rows_of_records(*read_coco(source, chosen, named, pictures))
     elif kind == "yolo":
         found, shape = read_yolo(source, chosen, shape, pictures), None  # its boxes are clipped
     else:
@@ -411,6 +411,8 @@ def _table_of(
                 raise DatasetError(f"{place}: {twice}, first at {before}")
     if labelled:
         _warn_of_copies(source, columns, places)
+    if len(boxes) and boxes.min() >= 0 and boxes.max() <= 1:
+        _LOGGER.warning("%s: all boxes are within 1 pixel, as fractions of the frame are; use pixels", source)
     if shape is not None:
         columns["boxes"] = clip_boxes(boxes, shape)
         gone = np.flatnonzero((columns["boxes"][:, :2] == columns["boxes"][:, 2:]).any(axis=1))

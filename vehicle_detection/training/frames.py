@@ -115,8 +115,8 @@ def find_sources(folder: str | os.PathLike[str], *, clip_rate: float = 3.0) -> l
 
 def _read_frames(root: Path, file: Path, clip_rate: float) -> LabelledFrames:
     """Frames of one file of labels, from a folder of images or a video."""
-    name, labels = file.stem, read_labels(file)
-    folders = root / "frames" / name, root / name
+    name, folders = file.stem, (root / "frames" / file.stem, root / file.stem)
+    labels = read_labels(file, images=next(filter(Path.is_dir, folders), None))
     for folder in folders:
         if folder.is_dir():
             found = LabelledFrames(name, load_frames(folder), labels)
