@@ -8,7 +8,6 @@ import functools
 import os
 import threading
 import time as clock
-import warnings
 from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar, Protocol, Self, cast, overload
@@ -16,7 +15,15 @@ from typing import Any, ClassVar, Protocol, Self, cast, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Closing, available_cores, check, invalid, pluralize, suggest_keywords
+from vehicle_detection._common import (
+    Closing,
+    available_cores,
+    check,
+    invalid,
+    pluralize,
+    suggest_keywords,
+    warn,
+)
 from vehicle_detection.annotator import Annotator
 from vehicle_detection.boxes import Detections, Platt
 from vehicle_detection.camera import Camera, open_camera
@@ -541,11 +548,10 @@ class VehicleDetector(Closing):
         """Warn the caller of `process` or `track`, once, that speeds depend on an assumed frame rate."""
         if any(track.speed_mps is not None for track in result.shown):
             self._warned = True
-            warnings.warn(
+            warn(
                 f"the speeds assume {USUAL_FPS:g} frames per second, because the frames came without times; "
                 "pass their times in seconds to process, or call detector.reset(fps=...) first; in moviepy "
-                "use annotate_clip(clip, detector)",
-                stacklevel=4,
+                "use annotate_clip(clip, detector)"
             )
 
     def annotate(self, frame: Image, result: FrameResult) -> Image:

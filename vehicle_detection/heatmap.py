@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import warnings
 from collections import deque
 from dataclasses import dataclass
 from itertools import islice
@@ -14,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check, fields, invalid
+from vehicle_detection._common import check, fields, invalid, warn
 from vehicle_detection.boxes import Detections, clip_boxes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.search import SearchParams
@@ -77,12 +76,11 @@ class HeatParams(fields.Checked):
             return dataclasses.replace(self, threshold=expected.default)
         if not expected.low <= self.threshold <= expected.high:
             many = "few" if self.threshold > expected.high else "many"
-            warnings.warn(
+            warn(
                 f"the heat threshold {self.threshold:g} does not fit the density of this search: too {many} "
                 f"windows are hot. With weighting={self.weighting!r} and peak_fraction="
                 f"{self.peak_fraction:g} expect {expected.low:.2g} to {expected.high:.2g}; omit the "
-                f"threshold for the default of {expected.default:.2g}",
-                stacklevel=3,
+                f"threshold for the default of {expected.default:.2g}"
             )
         return self
 

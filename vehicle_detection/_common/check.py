@@ -10,6 +10,8 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import sys
+import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from numbers import Real
 from pathlib import Path
@@ -26,6 +28,16 @@ Floats = NDArray[np.float64]
 _MAX_INTEGER = 2**53
 # Bytes of a path, and of each name in it: the limits of Linux, not lower than those of other systems.
 _MAX_PATH, _MAX_NAME = 4096, 255
+
+
+def warn(message: str) -> None:
+    """Warn with the line of the user's code that called the library."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_back.f_globals.get("__name__", "").startswith(
+        "vehicle_detection."
+    ):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level + 1)
 
 
 def describe(value: object) -> str:

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from vehicle_detection import _kernels as kernels
 from vehicle_detection import features as library
-from vehicle_detection._common import check, describe, fields, invalid, is_listing
+from vehicle_detection._common import check, describe, fields, invalid, is_listing, warn
 from vehicle_detection.course.versions import (
     CHANNEL_ORDERS,
     READERS,
     check_range,
     check_switch,
     lesson_function,
-    warn,
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import COLOR_SPACES, PATCH_SIZE, SPATIAL_ORDERS, FeatureParams

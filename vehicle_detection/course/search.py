@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import describe, fields, invalid
+from vehicle_detection._common import describe, fields, invalid, warn
 from vehicle_detection.course.features import (
     FeatureOptions,
     Image,
@@ -30,7 +30,7 @@ from vehicle_detection.course.features import (
     is_unit,
     warn_of_first_bin,
 )
-from vehicle_detection.course.versions import FORMULAS, RETURNS, lesson_function, warn
+from vehicle_detection.course.versions import FORMULAS, RETURNS, lesson_function
 from vehicle_detection.course.windows import BLUE, THICKNESS, Corners, box_rows, corner_array
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PATCH_SIZE

@@ -6,9 +6,7 @@ import contextlib
 import functools
 import inspect
 import itertools
-import sys
 import tempfile
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -17,7 +15,7 @@ from unittest import mock
 import cv2
 import numpy as np
 
-from vehicle_detection._common import check, describe
+from vehicle_detection._common import check, describe, warn
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import SPATIAL_ORDERS
 
@@ -106,16 +104,6 @@ def set_lesson_defaults(**options: Any) -> None:
     for name in options:
         check.choice(name, "a name of an option", tuple(_OPTIONS))
     lesson_defaults.update({name: _OPTIONS[name][0](value, name) for name, value in options.items()})
-
-
-def warn(message: str) -> None:
-    """Warn with the line of the user's code that called the library."""
-    frame, level = sys._getframe(1), 2
-    while frame.f_back is not None and frame.f_back.f_globals.get("__name__", "").startswith(
-        "vehicle_detection."
-    ):
-        frame, level = frame.f_back, level + 1
-    warnings.warn(message, stacklevel=level + 1)
 
 
 def lesson_function(**renamed: str) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:

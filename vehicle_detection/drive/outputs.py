@@ -91,7 +91,8 @@ def cut_clips(
     folder
         Existing folder; the clips are called ``0012.4s_cut_in_7.mp4`` after time, kind and track.
     margin
-        Seconds before and after the frames of an event, of which at most 5 s are shown on either side.
+        Seconds before the first and after the last frame of an event; a clip has at most 5 s before and 5 s
+        after the event's time.
     progress
         Show a progress bar if standard error is a terminal.
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -21,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Floats, check, invalid
+from vehicle_detection._common import Floats, check, invalid, warn
 from vehicle_detection.boxes import LOG_ODDS, Detections, Platt, box_areas, on_one_vehicle
 from vehicle_detection.camera import Camera, FrameShape, truncated_edges
 from vehicle_detection.tracking.association import (
@@ -308,10 +307,9 @@ class Tracker:
         """Keep the best detections of a frame that has too many, and warn of the first such frame."""
         if len(found) > _MAX_DETECTIONS and not self._warned:
             self._warned = True
-            warnings.warn(
+            warn(
                 f"a frame has {len(found)} detections; the {_MAX_DETECTIONS} best of a frame are tracked: "
-                "raise the threshold of the detector",
-                stacklevel=3,
+                "raise the threshold of the detector"
             )
         return found[:_MAX_DETECTIONS]
 
