@@ -103,7 +103,6 @@ def test_numbers_without_times():
         ("unknown", ["GOPR0007.MP4", "GP010007.MP4", "GP020007.MP4"]),
         ("unknown", ["GL010007.MP4"]),
     ]
-    assert len(find_trips(["drive.mp4", "walk.mp4"])) == 2
     assert len(find_trips(["drive1.mp4", "drive2.mp4", "drive3.mp4"])) == 3
 
 
@@ -192,7 +191,6 @@ def test_paths_and_urls_keep_their_type():
     assert trip.files == (Path("a/20260131_081500.mp4"),)
     (trip,) = find_trips(["s3://bucket/a/20260131_081500.mp4"])
     assert trip.files == ("s3://bucket/a/20260131_081500.mp4",)
-    assert str(trip) == "1 file"
 
 
 def test_the_query_of_a_url_tells_no_time():

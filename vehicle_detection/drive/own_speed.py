@@ -156,7 +156,7 @@ def read_own_speed(path: str | os.PathLike[str], *, offset: float = 0.0) -> OwnS
     """
     check.path(path, "path")
     file = Path(path)
-    shift = check.number(offset, "offset", low=-1e9, high=1e9)
+    shift = check.number(offset, "offset", low=-1e12, high=1e12)  # also Unix time
     readers = {".gpx": _read_gpx, ".nmea": _read_nmea, ".csv": _read_csv}
     reader = readers.get(file.suffix.lower())
     if reader is None:
