@@ -52,8 +52,8 @@ _INDEXED = ("mov", "matroska")
 _REORDERING = 0.5
 # Steps in seconds by which a seek is moved back until decoding begins before the wanted time; in a network,
 # where each costs a connection, only some.
-_STEPS = (0, 1, 4, 16, 64)
-_NETWORK_STEPS = (4, 64)
+_STEPS: tuple[float, ...] = (0, 1, 4, 16, 64)
+_NETWORK_STEPS: tuple[float, ...] = (4, 64)
 # Error of a frame rate that ffmpeg has derived from the file's times.
 _RATE_ERROR = Fraction(6, 1000)
 _REPEATED = re.compile(r"Last message repeated (\d+) times")
@@ -230,18 +230,20 @@ def find_seek_time(path: Path | str, info: VideoInfo, wanted: float) -> float:
     """Return a time in the file from which ffmpeg decodes the frame at `wanted`, in seconds.
 
     In files without an index, such as MPEG-TS, decoding begins with the next key frame after it, perhaps
-    seconds later. Therefore the time of the first decoded frame is checked.
+    seconds later, and without key frames, as with intra refresh, when all parts of a frame are new. Therefore
+    the time of the first decoded frame is checked.
     """
     if not info.duration:  # raw streams have no times; ffmpeg's are wrong after a seek
         return info.video_offset
-    indexed = info.container.startswith(_INDEXED)
     steps = _NETWORK_STEPS if isinstance(path, str) else _STEPS
-    for seconds in (_REORDERING,) if indexed else steps:
+    if info.container.startswith(_INDEXED):
+        steps = (_REORDERING, *steps[1:])
+    for seconds in steps:
         # A whole number of frames earlier, because ffmpeg may round times to frames.
         seek = wanted - float(math.ceil(seconds * info.fps) / info.fps)
         if seek <= info.video_offset:
             break
-        if indexed or _first_time(path, info.stream, seek) <= wanted - seek:
+        if _first_time(path, info.stream, seek) <= wanted - seek:
             return seek
     return info.video_offset
 
