@@ -74,9 +74,6 @@ def test_frames_of_a_video_that_starts_after_its_sound(folder):
     assert probe_video(target).start_time == 0  # so that subtitles and reports are in time
     with read_frames(late, start=0.2, end=0.3) as frames:
         assert [index for index, _, _ in frames] == [5, 6, 7]
-    process_video(late, target, StubDetector(), start=0.2)
-    assert frame_numbers(target) == [5, 6, 7, 8, 9]
-    assert sound_seconds(target) == pytest.approx(0.4, abs=0.06)
 
 
 def numbers_from(path, first, count=1, fps=25):
@@ -104,6 +101,7 @@ def test_any_frame_of_any_container_can_be_the_first_one(tmp_path, suffix, fps):
     [
         ("clip.mp4", "-movflags", "frag_keyframe+empty_moov", "-bf", 2, "-g", 8),
         ("clip.ts", "-x264-params", "intra-refresh=1:keyint=8", "-bf", 0),
+        ("clip.mp4", "-x264-params", "intra-refresh=1:keyint=12", "-bf", 0),
         ("clip.ts", "-c:v", "mpeg4", "-q:v", 2, "-bf", 0, "-g", 8),
         ("clip.avi", "-c:v", "mpeg4", "-q:v", 2, "-bf", 2, "-g", 8),
         ("clip.h264", "-bf", 0, "-g", 8),
@@ -112,9 +110,10 @@ def test_any_frame_of_any_container_can_be_the_first_one(tmp_path, suffix, fps):
 )
 def test_any_frame_of_streams_without_exact_key_frames_can_be_the_first_one(tmp_path, options):
     name, *options = options
-    path = write_clip(tmp_path / name, gray_frames(24), options=options)
+    fps = 5 if name == "clip.mp4" else 25  # a refresh takes longer than the smallest step back
+    path = write_clip(tmp_path / name, gray_frames(24, 256), fps=fps, options=options)
     for first in range(1, 20, 3):
-        assert numbers_from(path, first) == [first]
+        assert numbers_from(path, first, fps=fps) == [first]
 
 
 def test_a_stream_cut_before_its_first_key_frame(tmp_path):
@@ -179,6 +178,13 @@ def test_sound_stays_with_its_frames(tmp_path, suffix, delay, target):
     assert sound_seconds(tmp_path / target) == pytest.approx(0.75 - max(-delay, 0), abs=0.07)
 
 
+def test_sound_of_a_video_that_was_trimmed_without_encoding(tmp_path):
+    source, cut = write_beep(tmp_path / "clip.mp4", options=("-g", 12)), tmp_path / "cut.mp4"
+    ffmpeg("-ss", 0.3, "-i", source, "-c", "copy", cut)
+    process_video(cut, tmp_path / "out.mp4", StubDetector(), start=0.25)
+    assert beeps(tmp_path / "out.mp4") == pytest.approx([0.05], abs=0.02)
+
+
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])
 def test_a_varying_rate_becomes_constant(folder, suffix):
     # Frames 0-9 at 10 frames/s, then every third one, as recorded by a phone in the dark.
@@ -235,14 +241,12 @@ def test_sound_that_mp4_does_not_support_is_encoded(clip, tmp_path):
     process_video(source, tmp_path / "out.mp4", StubDetector())
     assert probe_video(tmp_path / "out.mp4").audio_codec == "aac"
     assert sound_seconds(tmp_path / "out.mp4") == pytest.approx(20 / NTSC, abs=0.06)
-    assert frame_numbers(tmp_path / "out.mp4") == list(range(20))
 
 
 @pytest.mark.parametrize(("width", "height"), [(63, 48), (64, 47), (63, 47)])
 def test_odd_sizes_are_extended_by_one_pixel(tmp_path, width, height):
     image = np.full((height, width, 3), (200, 120, 40), np.uint8)
-    options = ["-pix_fmt", "yuv444p"]
-    source = write_clip(tmp_path / "odd.mp4", [image] * 4, options=options)
+    source = write_clip(tmp_path / "odd.mp4", [image] * 4, options=["-pix_fmt", "yuv444p"])
     stub = StubDetector()
     report = process_video(source, tmp_path / "even.mp4", stub)
     assert report.shape == (height, width, 3)

@@ -56,6 +56,9 @@ _COPIED_AUDIO = {"mp4": {"aac", "mp3"}, "mov": {"aac", "mp3"}}
 _COPIED_AUDIO["matroska"] = {*_COPIED_AUDIO["mp4"], "ac3", "eac3", "flac", "opus", "vorbis"}
 # Fills and cuts the sound where its times and its samples differ by more than 20 ms.
 _SYNCHRONIZED = "aresample=async=1:min_hard_comp=0.02"
+# Seconds before the start from which the sound is decoded: after a jump into a file that was trimmed without
+# encoding, ffmpeg leaves out as much of it as was trimmed.
+_SOUND_BEFORE = 10.0
 
 
 PRESETS = (
@@ -151,14 +154,18 @@ class FrameWriter(Closing):
         sound, mapped = list[str](), ["-map", "0:v:0"]
         if audio is not None:
             lead = audio.start - audio.audio_offset
-            if lead:
-                sound += ["-ss", f"{audio.start:.6f}"] if lead > 0 else ["-itsoffset", f"{-lead:.6f}"]
-            sound += ["-vn", *audio.input]
             # Matroska has no times before 0, for the part of a packet before the first frame.
             copyable = audio.copyable and (lead <= 0 or container != "matroska")
             copied = copyable and info.audio_codec in _COPIED_AUDIO[container]
-            end = "" if audio.length is None else f",atrim=end={audio.length:.6f}"
-            encoded = ["-c:a", "aac", "-b:a", "192k", "-af", _SYNCHRONIZED + end]
+            before = 0.0 if copied else min(max(lead, 0.0), _SOUND_BEFORE)
+            if lead > before:
+                sound += ["-ss", f"{audio.start - before:.6f}"]
+            elif lead < 0:
+                sound += ["-itsoffset", f"{-lead:.6f}"]
+            sound += ["-vn", *audio.input]
+            end = "" if audio.length is None else f":end={before + audio.length:.6f}"
+            part = f"atrim=start={before:.6f}{end},asetpts=PTS-{before:.6f}/TB"
+            encoded = ["-c:a", "aac", "-b:a", "192k", "-af", f"{_SYNCHRONIZED},{part}"]
             mapped += ["-map", f"1:a:{info.audio_track}", *(["-c:a", "copy"] if copied else encoded)]
         filters = "setparams=colorspace=smpte170m:color_primaries=bt709:color_trc=bt709:range=tv"
         encoder = [*encoding.options(filters), "-fps_mode", "passthrough"]
