@@ -201,6 +201,11 @@ def test_results_take_the_categories_of_their_truth(tmp_path):
     assert read_labels(results, truth=truth)["label"].tolist() == ["bus", "car"]
     with pytest.raises(InvalidInputError, match="boxes, which include 'vehicle', got 'car', 'bus'"):
         write_labels(boxes_of((0, 1, CAR, 0.5)), results, format="coco_results", truth=truth)
+    # Results of Ultralytics: numbers in the names of files are no ids.
+    write_labels(labels.renamed(lambda frame: f"in/{frame}.jpg"), truth)
+    for names in ({"image_id": "1"}, {"image_id": 0, "file_name": "1.jpg"}):
+        results.write_text(json.dumps([{"category_id": 2, "bbox": [1, 2, 3, 4], "score": 0.5, **names}]))
+        assert read_labels(results, truth=truth)["frame"].tolist() == ["in/1.jpg"]
 
 
 # --- motmetrics ---

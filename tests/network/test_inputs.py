@@ -61,17 +61,10 @@ def test_a_fixed_size_pads_or_stretches():
     assert not array.any()
 
 
-@pytest.mark.parametrize(
-    ("shape", "factor"),
-    [
-        ((720, 1280), 2),
-        ((1080, 1920), 3),
-        ((2160, 3840), 6),
-        ((1920, 1080), 3),
-        ((540, 960), 1),
-        ((721, 1281), 1),
-    ],
-)
+FACTORS = {(720, 1280): 2, (1080, 1920): 3, (2160, 3840): 6, (1920, 1080): 3, (540, 960): 1, (721, 1281): 1}
+
+
+@pytest.mark.parametrize(("shape", "factor"), FACTORS.items())
 def test_a_reduced_frame_gives_the_same_input(shape, factor):
     network = InputFormat(None, "uint8", False)
     assert network.reduction(shape, 640) == factor

@@ -125,17 +125,24 @@ def test_other_classes(tmp_path, kind):
 
 def test_every_class_with_the_name_of_a_vehicle_counts(tmp_path, caplog):
     outputs = {"output0": dense(CELLS, 3).transpose(0, 2, 1)}
-    assert len(find(load(tmp_path, constant_network(outputs))).vehicles) == 2  # without names
+    assert len(find(load(tmp_path, constant_network(outputs))).vehicles) == 2
+    assert "names no classes, so all are vehicles; classes= selects some" in caplog.text
     network = constant_network(outputs, metadata={"names": "['car', 'Pickup Truck', 'Car']"})
     for options in ({}, {"classes": ["car"]}):
         assert load(tmp_path, network, **options).class_ids.tolist() == [0, 2]
     assert caplog.text.count("vehicles of class pickup truck are left out") == 1
 
 
-def test_logits_are_no_probabilities(tmp_path):
-    model = load(tmp_path, constant_network({"output0": 5 * dense(CELLS).transpose(0, 2, 1)}))
-    with pytest.raises(ModelFileError, match="invalid values: scores are not probabilities, but up to 4;"):
-        find(model)
+@pytest.mark.parametrize(
+    ("outputs", "message"),
+    [
+        ({"output0": 5 * dense(CELLS).transpose(0, 2, 1)}, "scores are not probabilities, but up to 4;"),
+        ({"boxes": 96 * BOXES, "scores": LOGITS}, "boxes are not fractions of the image;"),  # of YOLO-NAS
+    ],
+)
+def test_outputs_of_another_kind_are_refused(tmp_path, outputs, message):
+    with pytest.raises(ModelFileError, match=f"network.onnx computes invalid values: {message}"):
+        find(load(tmp_path, constant_network(outputs)))
 
 
 def test_a_network_whose_names_are_no_vehicles_needs_classes(tmp_path):
@@ -193,7 +200,7 @@ def test_candidates_are_sorted_and_above_the_minimum(kind, seed, spread, low):
         outputs = [array]
     if kind == "detr":
         outputs, order = [array[..., :4], array[..., 4:]], (0, 1)
-    found = OutputFormat(kind, None, kind == "detr", order).decode(outputs, SIZE, np.array([0, 1]), low)
+    found = OutputFormat(kind, None, order=order).decode(outputs, SIZE, np.array([0, 1]), low)
     assert found.boxes.shape == (len(found.probabilities), 4)
     assert (found.probabilities >= low - 1e-6).all()
     assert (np.diff(found.probabilities) <= 0).all()

@@ -140,6 +140,9 @@ def read_coco(
         _warn_of_sizes(source, file, images)
     vehicles = _vehicle_categories(file, source, classes)
     rows: list[tuple[str, Record]] = []
+    by_name: dict[str, FrameKey | None] = {}  # None: of several images
+    for key in file.images.values():
+        by_name[_base_name(key)] = None if _base_name(key) in by_name else key
     tracks = (_with_attributes(each).get("track_id") for each in file.annotations if isinstance(each, dict))
     free = max((track for track in tracks if isinstance(track, int)), default=NO_TRACK) + 1
     for number, entry in enumerate(file.annotations):
@@ -147,7 +150,12 @@ def read_coco(
         try:
             x, y, width, height = (parse_number(side, "bbox", where) for side in entry["bbox"])
             category = entry["category_id"]
-            frame, name = file.images[entry["image_id"]], file.categories[category]
+            image = entry[
+                "image_id"
+            ]  # Ultralytics writes the file's name, or its number, which may be another id
+            named = by_name.get(_base_name(entry.get("file_name", "" if image in file.images else image)))
+            frame = file.images[image] if named is None else named
+            name = file.categories[category]
         except (KeyError, TypeError, ValueError) as error:
             expected = "bbox [x, y, width, height], and image_id and category_id of an image and a category"
             raise DatasetError(f"{where}: expected {expected} in the file ({error})") from None
@@ -166,10 +174,16 @@ def read_coco(
     return rows, list(file.images.values())
 
 
+def _base_name(key: FrameKey, *, suffix: bool = False) -> str:
+    """File name of an image without its folder, and without suffix."""
+    name = str(key).replace("\\", "/").rpartition("/")[2]
+    return name if suffix else without_suffix(name)
+
+
 def _warn_of_sizes(source: Path, file: CocoFile, images: FrameSet) -> None:
     """Warn if images have another size than the one on which their boxes were drawn."""
     stated = {
-        str(key).replace("\\", "/").rpartition("/")[2]: (entry.get("width"), entry.get("height"))
+        _base_name(key, suffix=True): (entry.get("width"), entry.get("height"))
         for key, entry in zip(file.images.values(), file.entries)
     }
     known = [name for name in images.names if {*map(type, stated.get(name, ()))} == {int}]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import os
 from collections.abc import Collection
 from importlib import resources
@@ -33,6 +34,8 @@ from vehicle_detection.network.tensors import (
     recognize,
     usual_names,
 )
+
+_LOGGER = logging.getLogger(__name__)
 
 METADATA_KEY = "vehicle_detection"
 """Key of the ONNX metadata with the parameters of a network of this library, as JSON."""
@@ -229,6 +232,11 @@ def _class_ids(
                 f"those of its classes that are vehicles: {listed}"
             )
         warn_of_vehicles(name, numbers, VEHICLE_CLASSES)
+        if not known and model.output_format.n_classes != 1:
+            text = (
+                "%s names no classes, so all are vehicles; classes= selects some, such as [2, 5, 7] of COCO"
+            )
+            _LOGGER.warning(text, name)
         return np.array(sorted(ids), np.intp) if known else None
     ids = []
     count = model.output_format.n_classes or 1 << 31

@@ -207,7 +207,7 @@ class OutputFormat:
         """Decode the outputs for an input of this height and width to boxes of `classes` (None: all).
 
         The boxes are in pixels of the input, and the class of each is its most probable one. A
-        `ModelFileError` says what is not finite or no probability, without a name.
+        `ModelFileError` says what is not finite, no probability or no fraction, without a name.
         """
         boxes, scores, objectness, labels = self._split(outputs)
         kept = scores if classes is None or labels is not None else scores[classes[classes < len(scores)]]
@@ -259,6 +259,8 @@ class OutputFormat:
             chosen[:, :2] = (chosen[:, :2] + corners[rows]) * strides[rows, None]
             chosen[:, 2:] = np.exp(chosen[:, 2:].clip(max=20)) * strides[rows, None]
         if self.normalized:
+            if chosen.max(initial=0) > 2:  # such as those of YOLO-NAS, in pixels
+                raise ModelFileError("boxes are not fractions of the image")
             chosen *= [size[1], size[0], size[1], size[0]]
         if self.kind not in ("final", "lists"):
             half = chosen[:, 2:] / 2
