@@ -195,11 +195,16 @@ def test_a_pipe_or_device_is_no_image(tmp_path):
             read_image(path)
 
 
+RAW = io.BytesIO()
+Image.new("RGB", (9, 9)).save(RAW, "TIFF", tiffinfo={254: 1})
+
+
 @pytest.mark.parametrize(
     ("begin", "reason"),
     [
         *((begin, "complete") for begin in (b"not an image", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", bytes(1000))),
         (b"", "must be a complete image file .* it is empty"),
+        (RAW.getvalue(), "must be no raw photo, which holds a small preview"),
         (b"\0\0\0\x20ftypavif", "it is AVIF, convert it to PNG or JPEG"),
         (b"\0\0\0\x20ftypisom", "it is a video, which vehicle_detection.track reads"),
         (b"RIFF\0\0\0\0AVI LIST", "it is a video"),

@@ -98,6 +98,11 @@ def _tiff_tags(data: bytes) -> Any:
     return tags
 
 
+def _is_raw(tags: Any) -> bool:
+    """Whether a TIFF file, such as DNG or NEF, begins with a preview, and has the photo in another place."""
+    return bool(tags.get(254, 0) & 1) or 50706 in tags  # NewSubfileType and DNGVersion
+
+
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
     """Width and height in the frame header of a usual JPEG file, without the import of Pillow."""
     at = 2
@@ -122,6 +127,10 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
         raise InvalidInputError(
             f"{name} must have at most {Limit.PIXELS.current():,} pixels, got {size[0]}x{size[1]}; if the "
             f"image is meant to be so large, set {Limit.PIXELS.variable}"
+        )
+    if size is not None and _TIFF.match(data) and _is_raw(_tiff_tags(data)):
+        raise InvalidInputError(
+            f"{name} must be no raw photo, which holds a small preview; convert it to JPEG"
         )
     if re.match(rb".{4}ftyp(hei[cxms]|hev[cx]|mif1|msf1)", data, re.DOTALL):
         return _decode_heif(data, name)

@@ -94,6 +94,7 @@ def test_frames_are_checked(evaluate):
         pytest.param(["../in/07.jpg"], ["in/07.jpg"], id="longer path"),
         pytest.param(["07.5.jpg", "07.6.jpg"], ["07.5"], id="names with dots"),
         pytest.param(["07.jpg"], ["in\\07.jpg", "in\\08.jpg"], id="backslashes"),
+        pytest.param(["a\u0308.jpg"], ["in/\u00e4.png"], id="letters of macOS"),
     ],
 )
 def test_frame_names_may_differ_by_folder_and_suffix(ours, theirs):

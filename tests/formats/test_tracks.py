@@ -273,6 +273,7 @@ def test_an_error_in_the_results_leaves_the_earlier_file(tmp_path, name):
         (TrackTable(["a"], None, [[0, 0, 9, 9]]), {"fps": 25}, "fps must be omitted for frames with names"),
         (RESULTS, {"path": "yolo", "format": "yolo"}, r"shape must be \(height, width\)"),
         (RESULTS, {"path": "f", "format": "yolo", "shape": (9, 9)}, "path must be a new or empty folder"),
+        (RESULTS, {"path": ".", "format": "yolo", "shape": (9, 9)}, "path must be a new or empty folder"),
     ],
 )
 def test_bad_arguments(tmp_path, monkeypatch, results, options, message):

@@ -391,13 +391,6 @@ def test_frames_that_the_truth_does_not_have(tmp_path, kind):
         write_labels(boxes_of((0, 1, CAR, 0.5)), tmp_path / "t.json", truth=tmp_path / "none.json")
 
 
-def test_kitti_never_mixes_with_older_files(tmp_path):
-    (tmp_path / "old.txt").write_text("")
-    with pytest.raises(InvalidInputError, match="path must be a new or empty folder for KITTI"):
-        write_labels(boxes_of(("a", 1, CAR)), tmp_path, format="kitti")
-    assert [path.name for path in tmp_path.iterdir()] == ["old.txt"]
-
-
 def test_parquet_rows_name_their_place(tmp_path):
     import pyarrow
     from pyarrow import parquet

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import unicodedata
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -47,8 +48,11 @@ def match_names(table: TrackTable, keys: Sequence[FrameKey], sides: tuple[str, s
 
 
 def _path_of(name: str) -> str:
-    """Name of a frame as a path from a root, with slashes, without the suffix of an image."""
-    return "/" + without_suffix(name.replace("\\", "/"))
+    """Name of a frame as a path from a root, with slashes, without the suffix of an image.
+
+    macOS decomposes the letters of names, such as that of "ä" into "a" and an accent.
+    """
+    return "/" + without_suffix(unicodedata.normalize("NFC", name).replace("\\", "/"))
 
 
 def prepare_evaluation(

@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import json
 import logging
+import unicodedata
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -378,12 +379,14 @@ def _yolo_frames(files: Sequence[Path], shape: Any) -> list[tuple[FrameKey, tupl
 
 def _yolo_images(files: Sequence[Path], images: FrameSet) -> list[tuple[FrameKey, tuple[int, ...]]]:
     """Name and shape of the image of each file."""
-    names = {without_suffix(name): name for name in images.names}
+    # macOS decomposes the letters of names, such as that of "ä" into "a" and an accent.
+    names = {unicodedata.normalize("NFC", without_suffix(name)): name for name in images.names}
     frames: list[tuple[FrameKey, tuple[int, ...]]] = []
     for file in files:
-        if file.stem not in names:
+        image = names.get(unicodedata.normalize("NFC", file.stem))
+        if image is None:
             raise DatasetError(f"{file} has no image in {images.folder}; pass the folder of its image")
-        frames.append((names[file.stem], _image_shape(images.folder / names[file.stem])))
+        frames.append((image, _image_shape(images.folder / image)))
     return frames
 
 
