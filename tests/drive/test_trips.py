@@ -184,6 +184,8 @@ def test_cameras_kinds_of_recording_and_copies_in_low_resolution_are_told_apart(
     assert len(find_trips([f"{time}_{name}.mp4" for name in names.split()])) == 5
     names = [f"{time}_NF.mp4", "20260131_081600_EF.mp4", "20260131_081700_NFL.mp4"]  # one camera, in order
     assert summary(names) == [("front", names)]
+    names = [f"2026_0131_0815{n}0_000{n}F.{suffix}" for suffix in ("mp4", "TS") for n in range(3)]
+    assert summary(names, 10.0) == [("front", names[:3]), ("front", names[3:])]  # converted
 
 
 def test_paths_and_urls_keep_their_type():

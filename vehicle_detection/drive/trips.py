@@ -118,10 +118,10 @@ class Trip:
 def find_trips(files: Iterable[File], *, duration: Callable[[File], float] | None = None) -> list[Trip]:
     """Group files into trips, by their folders, names and lengths.
 
-    A segment follows another one of the same folder and camera if it starts when the other ends, by the times
-    in the names; or if it has the next number of four digits, and the modification times leave no gap. Where
-    these are not those of the camera, the numbers decide, with a warning. Gaps and overlaps begin another
-    trip. Front and rear cameras are different trips.
+    A segment follows another one of the same folder, camera and suffix if it starts when the other ends, by
+    the times in the names; or if it has the next number of four digits, and the modification times leave no
+    gap. Where these are not those of the camera, the numbers decide, with a warning. Gaps and overlaps begin
+    another trip. Front and rear cameras are different trips.
 
     Parameters
     ----------
@@ -141,13 +141,14 @@ def find_trips(files: Iterable[File], *, duration: Callable[[File], float] | Non
     front 2026-01-31 09:30:00 1
     rear 2026-01-31 08:15:00 1
     """
-    groups: defaultdict[tuple[str, str, str, bool], list[_Segment]] = defaultdict(list)
+    groups: defaultdict[tuple[str, str, str, bool, str], list[_Segment]] = defaultdict(list)
     for file in check.sequence(files, "files", "paths"):
         if not isinstance(file, (str, Path)):
             raise InvalidInputError(f"files must be paths or URLs, got {describe(file)}; pass strings")
         each = _parse_name(file)
-        # Folders named after cameras are told apart by their path already.
-        groups[str(each.name.parent), each.camera, each.series, each.start is not None].append(each)
+        # Cameras with folders of their own are told apart by the path, and converted copies by the suffix.
+        folder, suffix = str(each.name.parent), each.name.suffix.lower()
+        groups[folder, each.camera, each.series, each.start is not None, suffix].append(each)
     _warn_of_dates([each for members in groups.values() for each in members])
     if duration is None:
         probed = [each.file for members in groups.values() if len(members) > 1 for each in members]
