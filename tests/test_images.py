@@ -204,6 +204,8 @@ Image.new("RGB", (9, 9)).save(RAW, "TIFF", tiffinfo={254: 1})
     [
         *((begin, "complete") for begin in (b"not an image", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", bytes(1000))),
         (b"", "must be a complete image file .* it is empty"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "Git LFS, run git lfs pull"),
+        (b"\n<html><body>", "it is a web page"),
         (RAW.getvalue(), "must be no raw photo, which holds a small preview"),
         (b"\0\0\0\x20ftypavif", "it is AVIF, convert it to PNG or JPEG"),
         (b"\0\0\0\x20ftypisom", "it is a video, which vehicle_detection.track reads"),

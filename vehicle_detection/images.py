@@ -57,6 +57,8 @@ _DARK = 64
 # Why a file is no image, by how it begins.
 _NOT_READ = {
     rb"\Z": "it is empty",
+    rb"version https://git-lfs": "it is the pointer of a file in Git LFS, run git lfs pull",
+    rb"\s*<(!DOCTYPE|html)": "it is a web page",
     rb".{4}ftypavi[fs]": "it is AVIF, convert it to PNG or JPEG",
     rb".{4}ftyp|RIFF.{4}AVI |\x1aE\xdf\xa3|G.{187}G": "it is a video, which vehicle_detection.track reads",
 }

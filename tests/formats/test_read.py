@@ -101,7 +101,7 @@ def test_csv_labels_need_only_frames_tracks_and_boxes(tmp_path, name):
         ("", "lacks the columns frame, track, .* found an empty file"),
         ("frame,x1,y1,x2,y2\n", "lacks the columns track; found frame, x1, .*labels have .*; predictions"),
         ("frame,score,x1,y1,x2,y2\n", "lacks the columns track_id; found"),
-        ("0,1,2,3,4,5,0,0,0\n", "lacks the columns frame.* found 0, 1, 2"),
+        ("# exported\n0,1,2,3,4,5,0,0,0\n", "lacks the columns frame.* found # exported"),
         (HEADER + ",x1\n", "has the column x1 more than once"),
         (f"{HEADER}\n0,1,0,0,9\n", "line 2: expected 9 columns, found 5"),
         (f"{HEADER}\n\n0,1,0,0,nan,9,0,0,0\n", "line 3: x2 must be a finite number, got 'nan'"),
@@ -255,8 +255,9 @@ def test_invalid_files_of_other_formats(tmp_path, name, text, message):
 
 
 def test_invalid_paths(tmp_path):
-    with pytest.raises(DatasetError, match="does not exist; check the path"):
-        read_labels(tmp_path / "none.csv")
+    for name, remedy in ((tmp_path / "none.csv", "check the path"), ("https://a.org/b.csv", "download it")):
+        with pytest.raises(DatasetError, match=f"does not exist; {remedy}"):
+            read_labels(name)
     for options, kind in (({}, "KITTI"), ({"format": "yolo", "shape": (9, 9)}, "folder of YOLO")):
         with pytest.raises(DatasetError, match=rf"holds no \.txt file; name a {kind} label"):
             read_labels(tmp_path, **options)
@@ -329,6 +330,8 @@ def test_an_archive_of_cvat(tmp_path):
     assert found.boxes.tolist() == [[10, 20, 40, 60]] * 2
     assert found["ignore"].tolist() == [False, True]
     assert len(read_labels(tmp_path / "t.zip", classes=["Person"])) == 1
+    zipfile.ZipFile(tmp_path / "t.zip").extractall(tmp_path)
+    assert read_labels(tmp_path / "gt" / "gt.txt").to_pandas().equals(found.to_pandas())
     assert len(read_labels(write_zip(tmp_path / "u.zip", text))) == 3
 
 
@@ -446,7 +449,7 @@ def test_files_without_a_class_of_vehicles_are_refused(tmp_path):
         ("1 0.5 0.5", r"a\.txt line 1: expected class, center and size, .*, found 3 values"),
         ("1 0.5 0.5 x 0.1", "side of the box must be a finite number, got 'x'"),
         ("1 0.5 0.5 0.1 0.1 1.5", "confidence must be from 0 to 1"),
-        ("1 90 40 9 9", "the box 90 40 9 9 lies outside the image; center and size are fractions"),
+        ("1 90 40 9 9 0.5", "the box 90 40 9 9 lies outside the image; center and size are fractions"),
     ],
 )
 def test_invalid_yolo_files(tmp_path, line, message):

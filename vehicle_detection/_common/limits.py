@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 from enum import Enum
 from pathlib import Path
@@ -71,7 +72,11 @@ def check_regular_file(
     try:
         status = path.stat()
     except FileNotFoundError:
-        raise error(f"{name} does not exist; check the path") from None
+        is_address = re.match("[a-z][a-z0-9+.-]+:/", str(path))
+        remedy = (
+            "download it first, as only images and videos may be URLs" if is_address else "check the path"
+        )
+        raise error(f"{name} does not exist; {remedy}") from None
     except (OSError, ValueError) as problem:  # ValueError: a null byte or a lone surrogate
         raise error(f"{name} cannot be read: {getattr(problem, 'strerror', None) or problem}") from problem
     if stat.S_ISDIR(status.st_mode):

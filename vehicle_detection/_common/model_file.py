@@ -92,7 +92,7 @@ def read_model(path: str | os.PathLike[str], kind: str) -> ModelData:
         return _parse(resource.read_bytes(), f"the shipped model {path!r}", kind)
     file = check.path(path)
     name = f"model file {file}"
-    if not os.path.lexists(file):
+    if not os.path.lexists(file) and file.name == str(file):
         raise ModelFileError(
             f"{name} does not exist; check the path, or name a shipped model: {', '.join(SHIPPED)}"
         )

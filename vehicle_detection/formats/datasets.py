@@ -404,7 +404,7 @@ def _yolo_record(where: str, words: list[str], shape: tuple[int, ...]) -> tuple[
         expected = "class, center and size, and perhaps confidence and track"
         raise DatasetError(f"{where}: expected {expected}, found {len(words)} values{outline}")
     x, y, width, height = (parse_number(word, "side of the box", where) for word in words[1:5])
-    if len(words) == 5 and not (abs(x - 0.5) < (1 + width) / 2 and abs(y - 0.5) < (1 + height) / 2):
+    if not all(-0.1 <= side <= 1.1 for side in (x, y, width, height)):
         reason = "lies outside the image; center and size are fractions of the image in YOLO"
         raise DatasetError(f"{where}: the box {' '.join(words[1:5])} {reason}")
     x, width, y, height = x * shape[1], width * shape[1], y * shape[0], height * shape[0]

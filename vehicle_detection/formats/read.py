@@ -84,6 +84,7 @@ def _read_csv(source: Path, classes: Collection[str] | None) -> FileRows:
     twice = sorted({name for name in (*BOX_COLUMNS, *_LABELS, *LABEL_COLUMNS) if names.count(name) > 1})
     if twice:
         raise DatasetError(f"{source} has the column {', '.join(twice)} more than once; keep one of each")
+    _check_columns(source, FileRows([], {name: [] for name in names}))
     lines = [(number, line) for number, line in lines[1:] if any(cell.strip() for cell in line)]
     for number, line in lines:
         if len(line) != len(names):
@@ -187,6 +188,9 @@ def _kitti_record(where: str, words: list[str], classes: Collection[str] | None)
 
 
 def _read_mot(source: Path, classes: Collection[str] | None) -> FileRows:
+    names = source.parent / "labels.txt"
+    if source.name == "gt.txt" and names.is_file():  # an unpacked archive of CVAT
+        return _read_cvat(source, read_text(source), read_text(names), classes)
     rows = list(_mot_rows(read_lines(source)))
     found = {number for *_, number in rows if number is not None}
     if classes is None:
@@ -239,11 +243,16 @@ def _is_mot_label(words: list[str]) -> bool:
 
 
 def _read_mot_zip(source: Path, classes: Collection[str] | None) -> FileRows:
-    """Read an archive of CVAT: MOTChallenge text whose pixels count from 0, and the names of the classes."""
+    """Read an archive of CVAT."""
     text, names = _read_members(source, "gt/gt.txt", "gt/labels.txt")
     if text is None:
         remedy = "export MOT 1.1 there, or unpack an archive of another format"
         raise DatasetError(f"{source} is not an archive of CVAT: it lacks gt/gt.txt; {remedy}")
+    return _read_cvat(source, text, names, classes)
+
+
+def _read_cvat(source: Path, text: str, names: str | None, classes: Collection[str] | None) -> FileRows:
+    """Read CVAT's MOTChallenge text, whose pixels count from 0, with the names of the classes."""
     wanted = VEHICLE_CLASSES if classes is None else classes
     labels = [name.strip().lower() for name in (names or "").splitlines() if name.strip()]
     if labels:
@@ -368,8 +377,8 @@ def read_labels(
         pictures = load_frames(check.path(images, "images", kind="the folder of the images"))
     if format is not None:
         check.choice(format, "format", _READ_FORMATS)
-    if not source.exists():
-        raise DatasetError(f"{source} does not exist; check the path")
+    if not source.is_dir():
+        check_regular_file(source, str(source), Limit.TEXT_BYTES, error=DatasetError)
     kind = format or _guess_format(source)
     if source.is_dir() and kind not in FOLDER_FORMATS:
         raise DatasetError(f"{source} is a folder, and {kind} labels are one file; pass its path")
