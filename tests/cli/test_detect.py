@@ -134,6 +134,8 @@ def test_a_damaged_but_readable_image_gives_a_warning(picture, tmp_path):
     result = run("detect", tmp_path / "road.jpg")
     assert result.exit_code == 0
     assert re.fullmatch(r"(warning: .+road.jpg: Corrupt JPEG data[^\n]*\n)+", result.stderr)
+    cv2.imwrite(str(tmp_path / "dark.png"), np.zeros((90, 160), np.uint16))
+    assert re.match(r"warning: image file .+dark.png is nearly", run("detect", tmp_path / "dark.png").stderr)
 
 
 BAD_IMAGES = {

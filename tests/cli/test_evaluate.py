@@ -9,9 +9,7 @@ from vehicle_detection.images import write_image
 
 def test_evaluate_scores_boxes_and_tracks(tmp_path):
     labels, tracks = tmp_path / "labels.csv", tmp_path / "tracks.csv"
-    labels.write_text(
-        "frame,track,x1,y1,x2,y2,occluded,truncated,ignore\n0,1,10,10,60,50,0,0,0\n1,1,12,10,62,50,0,0,0\n"
-    )
+    labels.write_text("frame,track,x1,y1,x2,y2\n0,1,10,10,60,50\n1,1,12,10,62,50\n")
     tracks.write_text(f"{HEADER}\n0,4,10,10,60,50,1.5\n1,4,12,10,62,50,1.5\n1,5,300,10,350,50,0.5\n")
     out = succeed("evaluate", tracks, labels, "--json", tmp_path / "scores.json")
     assert "Detections in 2 frames at IoU 0.5" in out
@@ -25,9 +23,7 @@ def test_evaluate_scores_boxes_and_tracks(tmp_path):
     mixed = run("evaluate", stills, labels)
     assert "tracks of" not in mixed.stdout
     assert "the tracks are not scored: 1 box has no track in" in mixed.stderr
-    labels.write_text(
-        "frame,track,x1,y1,x2,y2,occluded,truncated,ignore\n0,1,0,0,900,500,0,0,1\n1,1,12,10,62,50,0,0,0\n"
-    )
+    labels.write_text("frame,track,x1,y1,x2,y2,ignore\n0,1,0,0,900,500,1\n1,1,12,10,62,50,0\n")
     assert "1 found, 0 missed, 1 false, 0 ignored" in succeed("evaluate", stills, labels)
     assert "0 missed, 0 false, 1 ignored" in succeed("evaluate", stills, labels, "--ignored-as-regions")
 

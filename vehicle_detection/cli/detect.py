@@ -265,8 +265,8 @@ def _read_each(images: list[_Image], left_out: list[_Image]) -> Iterator[tuple[_
                 raise
             print_error(f"warning: {error}; left out")
             continue
-        for message in messages:
-            print_error(f"warning: {image}: {message}")
+        for message in messages:  # of the library, or of a decoder, which does not name the image
+            print_error(message if message.startswith("warning: ") else f"warning: {image}: {message}")
         yield image, pixels
 
 

@@ -18,6 +18,7 @@ from vehicle_detection.cli.output import (
     name_kept_files,
     option_names,
     output_folder,
+    print_error,
     print_line,
     print_table,
     run_interruptible,
@@ -75,8 +76,11 @@ def train(
     )
     options: dict[str, Any] = {"options": training, "split": split, "progress": True}
 
-    with capture_stderr():
+    with capture_stderr() as messages:
         patches = vd.load_training_patches(vehicles, non_vehicles)
+    for message in messages:
+        if message.startswith("warning: "):  # of the library, not of a decoder
+            print_error(message)
 
     def train_all() -> list[Any]:
         return [vd.train_and_evaluate(patches, params=params, **options) for params in presets]
