@@ -103,6 +103,7 @@ def test_any_frame_of_any_container_can_be_the_first_one(tmp_path, suffix, fps):
         ("clip.ts", "-x264-params", "intra-refresh=1:keyint=8", "-bf", 0),
         ("clip.mp4", "-x264-params", "intra-refresh=1:keyint=12", "-bf", 0),
         ("clip.ts", "-c:v", "mpeg4", "-q:v", 2, "-bf", 0, "-g", 8),
+        ("clip.ts", "-bsf:v", "h264_metadata=tick_rate=25"),  # it states half of its rate
         ("clip.avi", "-c:v", "mpeg4", "-q:v", 2, "-bf", 2, "-g", 8),
         ("clip.h264", "-bf", 0, "-g", 8),
         ("clip.mjpeg", "-c:v", "mjpeg", "-q:v", 2),

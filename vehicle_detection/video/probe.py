@@ -144,6 +144,10 @@ def _probe(path: Path | str, chosen: int | None) -> VideoInfo:
     fps, constant = frame_rate(decoded, stream)
     if container == "matroska,webm":  # its header may state a wrong rate
         fps, constant = _rate_of_times(fps, _frame_times(path, index))
+    # H.264 may state half of its rate; ffmpeg sees it by the times, which may also be those of fields.
+    faster = float(_find(r"([\d.]+) tbr", stream, "0")) > 1.05 * fps
+    if container in _JOINABLE and constant and faster:
+        fps = _rate_of_first_frames(path, index) or fps
     begin = float(_find(r"^  Duration: .*?, start: (-?[\d.]+)", header, "0"))
     duration = seconds_of(_find(r"^  Duration: ([\d:.]+)", header, "0:0:0"))
     if container in _DURATION_IS_END:
@@ -309,6 +313,16 @@ def joined_length(path: Path, info: VideoInfo) -> float:
     times = _frame_times(path, info.stream) if info.container in _JOINABLE else []
     length = times[-1] + float(1 / info.fps) if times else 0.0
     return length if length > info.duration + _JOINED_SECONDS else 0.0
+
+
+def _rate_of_first_frames(path: Path | str, stream: int) -> Fraction | None:
+    """Frame rate by the times of the first decoded frames; None if they have none."""
+    options = ("-map", f"0:{stream}", "-frames:v", "25", "-vf", "showinfo", "-f", "null", "-")
+    _, log = run_ffmpeg(path, (*pixel_limit(), *input_options(path), *options), level="info")
+    times = [float(each) for each in re.findall(r"n: *\d+ .*?pts_time:(-?[\d.]+)", log)]
+    steps = [after - before for before, after in itertools.pairwise(times)]
+    step = statistics.median(steps) if steps else 0.0
+    return Fraction(1 / step).limit_denominator(1001) if step > 0 else None
 
 
 def _rate_of_times(rate: Fraction, times: Sequence[float]) -> tuple[Fraction, bool]:
