@@ -180,7 +180,8 @@ def _from_first_point(points: Floats, name: str) -> Floats:
         points = points[~outlying]
     if len(points) < 2:
         nmea = name.lower().endswith(".nmea")
-        remedy = "record RMC sentences with dates and checksums" if nmea else "export a track, not a route"
+        remedy = "record RMC sentences with dates and checksums"
+        remedy = remedy if nmea else "export a track, not a route, with times as in 2026-05-01T08:00:00Z"
         raise InvalidInputError(
             f"path {name} must have at least two track points with times, got {len(points)}; {remedy}"
         )
@@ -401,6 +402,7 @@ def _speeds_of(points: Floats) -> Floats:
     """Speeds (m/s) by the positions of points; NaN where they are unknown, far apart in time, or jump."""
     speeds = np.full(len(points), np.nan)
     known = np.flatnonzero(np.isfinite(points[:, 2:]).all(axis=1))
+    known = known[_is_measured(points[known])]
     times, (latitude, longitude) = points[known, 0], np.deg2rad(points[known, 2:]).T
     steps = np.diff(times)
     jumps = _great_circle(latitude[:-1], longitude[:-1], latitude[1:], longitude[1:]) > _MAX_SPEED * steps
@@ -409,6 +411,17 @@ def _speeds_of(points: Floats) -> Floats:
         if len(part) > 1:
             speeds[known[part]] = _smooth_speeds(times[part], latitude[part], longitude[part])
     return speeds
+
+
+def _is_measured(points: Floats) -> NDArray[np.bool_]:
+    """Whether each position is measured: a log may repeat it until the receiver has the next one."""
+    measured = np.ones(len(points), np.bool_)
+    measured[1:] = np.diff(points[:, 2:], axis=0).any(axis=1)
+    seconds = np.diff(points[measured, 0], append=points[-1:, 0])  # until the next position
+    if len(points) < 2 or np.median(seconds) < 1.5 * np.median(np.diff(points[:, 0])):
+        return np.ones(len(points), np.bool_)
+    # Positions that are the same for longer are those of a vehicle that stands.
+    return np.asarray(measured | (seconds > _MAX_GAP)[np.cumsum(measured) - 1])
 
 
 def _smooth_speeds(times: Floats, latitude: Floats, longitude: Floats) -> Floats:
