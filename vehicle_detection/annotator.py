@@ -347,6 +347,7 @@ class Annotator:
     ) -> None:
         check.instance(style, "style", DrawParams | None, "omit it for the default")
         check.instance(heat, "heat", HeatParams | None, "omit it for the default")
+        check.instance(camera, "camera", Camera | None, "pass what open_camera returns")
         if own_speed is not None and not callable(getattr(own_speed, "at", None)):
             got = describe(own_speed)
             raise InvalidInputError(f"own_speed must have a method at, got {got}; pass read_own_speed(...)")

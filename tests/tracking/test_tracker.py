@@ -774,6 +774,8 @@ class TestArguments:
             tracker.update(found(CAR), 720)
         with pytest.raises(InvalidInputError, match="time must be a number"):
             tracker.update(found(CAR), SHAPE, time=math.nan)
+        with pytest.raises(InvalidInputError, match="gray must be an array"):
+            tracker.update(found(CAR), SHAPE, gray=[1, [2, 3]])
         (track,) = tracker.update(found(CAR), SHAPE)
         assert (track.id, track.misses) == (1, 0)
 

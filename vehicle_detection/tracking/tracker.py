@@ -205,7 +205,7 @@ class Tracker:
         calibration: Platt | None = LOG_ODDS,
     ) -> None:
         check.instance(params, "params", TrackParams | None, "pass TrackParams()")
-        check.instance(camera, "camera", Camera | None, "pass Camera.for_frame(image.shape)")
+        check.instance(camera, "camera", Camera | None, "pass what open_camera returns")
         check.instance(calibration, "calibration", Platt | None, "calibrate_scores makes one")
         self._calibration = calibration
         self._frame_seconds = 1 / check.number(fps, "fps", above=0, high=1e6)
@@ -278,8 +278,10 @@ class Tracker:
             detections = Detections.from_supervision(detections)
         check.instance(detections, "detections", Detections, "pass Detections(boxes, scores)")
         frame = check.shape(shape)
-        if gray is not None and (np.ndim(gray) != 2 or np.asarray(gray).dtype != np.uint8):
-            raise invalid("gray", "be an (H, W) uint8 array", gray, "pass tracking.small_gray(frame)")
+        if gray is not None:
+            gray = check.array(gray, "gray")
+            if gray.ndim != 2 or gray.dtype != np.uint8:
+                raise invalid("gray", "be an (H, W) uint8 array", gray, "pass tracking.small_gray(frame)")
         if check.boolean(cut, "cut"):
             self.end_tracks()
         dt = self._advance(frame, time, check.integer(frames, "frames", low=1))
