@@ -99,7 +99,7 @@ def test_boxes_of_other_classes_are_dropped(class_ids):
 @pytest.mark.parametrize(
     ("result", "message"),
     [
-        (None, r"it must be \(boxes, scores\) or \(boxes, scores, classes\), got None; for an image without"),
+        (None, r"it must be \(boxes, scores\), .* with xyxy, as .*, got None; for an image without"),
         (([BOX], [0.9], ["car"]), "class_ids must be one number for .*; pass names of classes as labels"),
         (([[0, 0, np.nan, 4]], [0.5]), "boxes must be finite"),
         (([[50, 50, 20, 20]], [0.5]), "boxes given as .x, y, width, height. need x"),

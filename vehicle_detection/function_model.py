@@ -159,8 +159,8 @@ class FunctionModel:
             if self.class_ids is not None:
                 found = select_classes(found, self.class_ids)
         else:
-            remedy = "for an image without vehicles return ([], [])"
-            raise invalid("it", "be (boxes, scores) or (boxes, scores, classes)", returned, remedy)
+            must = "be (boxes, scores), (boxes, scores, classes), or an object with xyxy, as Results.boxes"
+            raise invalid("it", must, returned, "for an image without vehicles return ([], [])")
         boxes = found.boxes
         if boxes.size and boxes.min() >= 0 and boxes.max() <= 1 and (box_areas(boxes) > 0).any():
             got = f"{boxes.min():g} to {boxes.max():g}, as fractions of the frame are"

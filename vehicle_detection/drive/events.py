@@ -220,7 +220,7 @@ def find_events(
         camera = Camera.for_frame(frame_shape)
     check.instance(camera, "camera", Camera, "omit it for a typical dash-cam")
     camera = camera.for_shape(frame_shape)
-    check.instance(table, "table", TrackTable, "append the results of process_video to one")
+    check.instance(table, "table", TrackTable, "pass TrackTable.from_results(results) or from_pandas(table)")
     histories = track_histories(table)
     length = max((track.last + 1 for track in histories), default=0)
     own_speed = _check_speed(own_speed_mps, length)

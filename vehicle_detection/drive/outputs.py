@@ -188,7 +188,7 @@ def write_subtitles(
     own speed 90 km/h
     no vehicle
     """
-    check.instance(table, "table", TrackTable, "append the results of process_video to one")
+    check.instance(table, "table", TrackTable, "pass TrackTable.from_results(results) or from_pandas(table)")
     target = check_suffix(path, "path", SUBTITLE_SUFFIXES)
     rate = check.number(fps, "fps", above=0, high=1e6)
     check.instance(own_speed, "own_speed", OwnSpeed | None, "pass what read_own_speed returns")

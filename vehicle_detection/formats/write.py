@@ -452,7 +452,7 @@ def write_labels(
     >>> read_labels(file)["frame"]
     array([0, 2])
     """
-    check.instance(labels, "labels", TrackTable, "collect the boxes of each frame in one")
+    check.instance(labels, "labels", TrackTable, "pass TrackTable.from_detections([found]) or from_results")
     kind = _check_format(path, format, _WRITERS)
     if truth is not None and not kind.startswith("coco"):
         raise InvalidInputError(f"truth must be None for the format {kind!r}; only COCO files have image ids")
