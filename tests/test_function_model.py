@@ -33,8 +33,7 @@ def moved(step):
 
 
 def returning(boxes, scores=None):
-    result = boxes if scores is None else (boxes, scores)
-    return lambda image: result
+    return lambda image: boxes if scores is None else (boxes, scores)
 
 
 def test_a_function_detects_tracks_and_draws():
@@ -101,9 +100,7 @@ def test_boxes_of_other_classes_are_dropped(class_ids):
     [
         (None, r"it must be \(boxes, scores\), .* with xyxy, as .*, got None; for an image without"),
         (([BOX], [0.9], ["car"]), "class_ids must be one number for .*; pass names of classes as labels"),
-        (([[0, 0, np.nan, 4]], [0.5]), "boxes must be finite"),
         (([[50, 50, 20, 20]], [0.5]), "boxes given as .x, y, width, height. need x"),
-        (([BOX[:3]], [0.5]), r"boxes must be an \(N, 4\) number array"),
         (([BOX], [7.2]), 'got 7.2 to 7.2; pass score="logit"'),
     ],
 )
