@@ -178,11 +178,6 @@ def test_a_function_has_the_interface_of_a_model():
     assert explorer.render().shape == (*SHAPE, 3)
 
 
-def test_a_threshold_is_refused_beside_a_range_of_scores():
-    with pytest.raises(InvalidInputError, match="threshold must be omitted with"):
-        detector_from(find_red, score=(0, 1), threshold=0.5)
-
-
 def test_boxes_as_fractions_of_the_frame_are_rejected():
     detector = detector_from(returning([[0.1, 0.2, 0.4, 0.5], [0.5, 0.5, 1, 1]], [0.9, 0.8]))
     with pytest.raises(DetectorError, match=r"boxes must be in pixels, got 0\.1 to 1, .* multiply x by"):

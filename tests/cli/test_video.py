@@ -324,7 +324,7 @@ def test_own_speed_that_cannot_be_read(text):
         read_speed(text, None, 0.0)
 
 
-def test_the_copy_is_named_after_its_source_and_replaces_no_file(clip, tmp_path):
+def test_the_copy_is_named_after_its_source_and_replaces_no_file(clip, tmp_path, monkeypatch):
     source = tmp_path / "drive.mp4"
     shutil.copy(clip, source)
     (tmp_path / "other").mkdir()
@@ -339,6 +339,8 @@ def test_the_copy_is_named_after_its_source_and_replaces_no_file(clip, tmp_path)
     before = contents(tmp_path)
     succeed("video", source, "--end", 0.1, "--tracks", tmp_path / "t.csv")
     assert contents(tmp_path) == sorted([*before, "t.csv"])
+    monkeypatch.chdir(tmp_path / "other")
+    assert f"wrote {tmp_path}/other_tracked.mp4" in succeed("video", ".", "--end", 0.1)
 
 
 def test_a_stated_horizon_that_the_sizes_of_the_vehicles_contradict_is_named(capsys):

@@ -152,6 +152,8 @@ class VideoOptions:
             return self
         if glob.has_magic(self.source) and not source.exists():
             return self
+        if source.name in ("", ".."):  # the current folder, or one above: the copy is written beside it
+            source = source.resolve()
         if folder is None:
             alone = not self.show and all(path is None for path in self.files().values())
             if not alone and self.report is None and self.clips is None:
@@ -160,7 +162,7 @@ class VideoOptions:
         elif not folder.is_dir():
             return self
         numbers = itertools.chain([""], (f"_{number}" for number in itertools.count(2)))
-        targets = (folder / f"{source.absolute().stem}_tracked{number}.mp4" for number in numbers)
+        targets = (folder / f"{source.stem}_tracked{number}.mp4" for number in numbers)
         return replace(self, output=next(target for target in targets if not target.exists()))
 
     def span(self) -> dict[str, Any]:
