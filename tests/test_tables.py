@@ -200,16 +200,22 @@ def test_missing_cells_of_a_table_are_the_usual_values():
 
 
 @pytest.mark.parametrize("name", ["class", "label", "category"])
-def test_rows_of_other_classes_are_dropped(name):
+def test_rows_of_other_classes_are_dropped(name, caplog):
     table = pd.DataFrame({"frame": [0, 0, 1, 2, 3], "track": range(5), "x1": 0, "y1": 0, "x2": 50, "y2": 40})
     table[name] = ["Car", "person", "tram", "person", None]
     labels = TrackTable.from_pandas(table)
     assert (labels.frame_keys, labels["ignore"].tolist()) == ((0, 1, 2, 3), [False, True])
+    assert "boxes without a class are left out: 1" in caplog.text
     assert TrackTable.from_pandas(table.assign(score=1.0))["frame"].tolist() == [0]  # predictions
-    assert len(TrackTable.from_pandas(table.assign(**{name: [0, 1, 0, 2, 2]}))) == 5  # numbers are no names
+    numbers = table.assign(**{name: [0.0, 1, 0, 2, 2]})  # they are no names
+    assert len(TrackTable.from_pandas(numbers)) == 5
+    assert "boxes of class 0, 1, 2 are read as vehicles" in caplog.text
+    assert len(TrackTable.from_pandas(numbers, classes=["2"])) == 2
     assert len(TrackTable.from_pandas(table, classes=["person"])) == 3
     with pytest.raises(InvalidInputError, match=r"no class among .*car.* found 'person', 'tram'; .*classes="):
         TrackTable.from_pandas(table[1:])
+    with pytest.raises(InvalidInputError, match="table has no classes; leave out classes="):
+        TrackTable.from_pandas(table.drop(columns=name), classes=["car"])
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from vehicle_detection._common import (
     invalid,
     is_listing,
     natural_key,
+    parse_number,
     pluralize,
     shorten,
     warn_of_vehicles,
@@ -531,21 +532,27 @@ def _vehicle_rows(
     """
     count = len(cells["frame"])
     given = [cells[name] for name in _CLASS_COLUMNS if name in cells]
-    names = [next((str(cell).lower() for cell in row if not _is_missing(cell)), "") for row in zip(*given)]
+    firsts = [next((cell for cell in row if not _is_missing(cell)), "") for row in zip(*given)]
+    names = [re.sub(r"^(\d+)\.0+$", r"\1", str(cell).strip().lower()) for cell in firsts]
     found = {*names} - {""}
     # Classes that are numbers or flags have no names: all rows are vehicles.
-    known = bool(found) and not any(re.fullmatch(r"[-\d.]+|true|false", name) for name in found)
-    if not known or (classes is None and any(cells.keys() >= own for own in _OWN_COLUMNS)):
+    numbered = any(re.fullmatch(r"[-\d.]+|true|false", name) for name in found)
+    is_own = any(cells.keys() >= own for own in _OWN_COLUMNS)
+    if not count or (classes is None and (not found or numbered or is_own)):
         others = found - {*VEHICLE_CLASSES, *LOOKALIKE_CLASSES}
-        if known and others and "score" not in cells:
+        if len(others) > numbered and (numbered or "score" not in cells):
             text = "%s: boxes of class %s are read as vehicles; classes= selects some"
             _LOGGER.warning(text, source, shorten(", ".join(sorted(others))))
-        return np.ones(count, np.bool_), np.zeros(count, np.bool_), names if known else None
+        return np.ones(count, np.bool_), np.zeros(count, np.bool_), names if found and not numbered else None
+    if not found:
+        raise DatasetError(f"{source} has no classes; leave out classes=")
     wanted = VEHICLE_CLASSES if classes is None else classes
     check_classes(source, found, wanted)
+    if "" in names:
+        _LOGGER.warning("%s: boxes without a class are left out: %d", source, names.count(""))
     vehicles = np.array([name in wanted for name in names])
     lookalike = ~vehicles & np.isin(names, LOOKALIKE_CLASSES) & (not predicted)
-    return vehicles | lookalike, lookalike, names
+    return vehicles | lookalike, lookalike, None if numbered else names
 
 
 def check_classes(
@@ -558,23 +565,6 @@ def check_classes(
         raise DatasetError(f"{source} {must}; found {listed}; name those of vehicles with classes=")
     if wanted is VEHICLE_CLASSES:
         warn_of_vehicles(str(source), found, {*wanted, *LOOKALIKE_CLASSES})
-
-
-def parse_number(cell: Any, name: str, place: str) -> float:
-    """Parse a finite number, an int where it is one."""
-    try:
-        if isinstance(cell, bool) or "_" in str(cell):  # Python reads 1_0 as 10
-            raise ValueError
-        # A float would round ids above 2**53, and so join two tracks.
-        is_integer = isinstance(cell, (int, np.integer)) or str(cell).strip().isdecimal()
-        value: float = int(cell) if is_integer else float(cell)
-        finite = math.isfinite(value)
-    except (TypeError, ValueError, OverflowError):
-        value, finite = math.nan, False
-    if not finite:
-        hint = "; use a decimal point" if re.fullmatch(r"\s*-?\d+,\d+\s*", str(cell)) else ""
-        raise DatasetError(f"{place}: {name} must be a finite number, got {check.describe(cell)}{hint}")
-    return value
 
 
 def _parse_numbers(name: str, cells: Sequence[Any], places: Sequence[str]) -> NDArray[Any]:

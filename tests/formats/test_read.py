@@ -105,7 +105,6 @@ def test_csv_labels_need_only_frames_tracks_and_boxes(tmp_path, name):
         (HEADER + ",x1\n", "has the column x1 more than once"),
         (f"{HEADER}\n0,1,0,0,9\n", "line 2: expected 9 columns, found 5"),
         (f"{HEADER}\n\n0,1,0,0,nan,9,0,0,0\n", "line 3: x2 must be a finite number, got 'nan'"),
-        (f"{HEADER}\n0,1,0,0,1e999,9,0,0,0\n", "line 2: x2 must be a finite number"),
         (f"{HEADER}\n0,1,0,0,,9,0,0,0\n", "line 2: x2 must be a finite number, got ''"),
         (f"{HEADER}\n0,1,0,0,-9,9,0,0,0\n", r"line 2: a box needs x1 < x2 and y1 < y2, got \[0.0, 0.0, -9.0"),
         (f"{HEADER}\n0,1,0,5,9,5,0,0,0\n", "line 2: a box needs x1 < x2 and y1 < y2"),
@@ -197,7 +196,6 @@ def coco(**changes):
 
 
 BOX = {"image_id": 5, "category_id": 1, "bbox": [1, 2, 3, 4]}
-MIXED = [json.dumps({"frame": frame, "track": 1, "x1": 1, "y1": 1, "x2": 9, "y2": 9}) for frame in (0, "a")]
 
 
 def test_coco_file(tmp_path, caplog):
@@ -235,8 +233,6 @@ def test_coco_file(tmp_path, caplog):
         ("a.json", coco(categories=[{"id": 1, "name": "boat"}]), "no category among bus, .* found 'boat'"),
         ("a.jsonl", '{"frame": 0}\n', "lacks the columns track, x1, .*; found frame"),
         ("a.jsonl", "{", "line 1: not a JSON object"),
-        ("a.jsonl", "\n".join(MIXED), "frame must be a number in every row, or a name in every row"),
-        ("a.jsonl", "\n".join(MIXED[::-1]), "frame must be a number in every row, or a name"),
         ("a.jsonl", "\n[]", "line 2: expected a JSON object, found"),
         ("a.parquet", "frame", "is not a Parquet file"),
         ("a.txt", "Car 0 0 0 1 2 3", "lacks the columns"),

@@ -27,6 +27,7 @@ from vehicle_detection._common.text import (
     is_web_address,
     local_path,
     natural_key,
+    parse_number,
     parse_yaml,
     pluralize,
     spreadsheet_text,

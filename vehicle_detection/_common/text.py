@@ -1,12 +1,18 @@
-"""Text of counts, names, URLs and YAML: messages show URLs without their passwords and signatures."""
+"""Text of numbers, names, URLs and YAML: messages show URLs without their passwords and signatures."""
 
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections.abc import Iterable
 from typing import Any
 from urllib.parse import unquote_plus
+
+import numpy as np
+
+from vehicle_detection._common.check import describe
+from vehicle_detection.errors import DatasetError
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -56,6 +62,23 @@ def warn_of_vehicles(source: str, found: Iterable[str], read: Iterable[str]) -> 
             source,
             ", ".join(others[:9]),
         )
+
+
+def parse_number(cell: Any, name: str, place: str) -> float:
+    """Parse a finite number, an int where it is one."""
+    try:
+        if isinstance(cell, bool) or "_" in str(cell):  # Python reads 1_0 as 10
+            raise ValueError
+        # A float would round ids above 2**53, and so join two tracks.
+        is_integer = isinstance(cell, (int, np.integer)) or str(cell).strip().isdecimal()
+        value: float = int(cell) if is_integer else float(cell)
+        finite = math.isfinite(value)
+    except (TypeError, ValueError, OverflowError):
+        value, finite = math.nan, False
+    if not finite:
+        hint = "; use a decimal point" if re.fullmatch(r"\s*-?\d+,\d+\s*", str(cell)) else ""
+        raise DatasetError(f"{place}: {name} must be a finite number, got {describe(cell)}{hint}")
+    return value
 
 
 def parse_yaml(text: str) -> Any:

@@ -13,7 +13,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vehicle_detection._common import Limit, check, describe, invalid, parse_yaml, read_regular_file
+from vehicle_detection._common import (
+    Limit,
+    check,
+    describe,
+    invalid,
+    parse_number,
+    parse_yaml,
+    read_regular_file,
+)
 from vehicle_detection.boxes import clip_boxes, confidence_score
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import DatasetError, InvalidInputError
@@ -42,7 +50,6 @@ from vehicle_detection.tables import (
     TrackTable,
     check_classes,
     frame_order,
-    parse_number,
 )
 
 _LOGGER = logging.getLogger(__name__)
@@ -446,4 +453,4 @@ def _yaml_names(file: Path) -> dict[str, str]:
     if not names or not isinstance(names, (list, dict)):
         raise DatasetError(f"{file} names no class; write them as names: [car, bus]")
     listed = enumerate(names) if isinstance(names, list) else names.items()
-    return {str(number): str(name).lower() for number, name in listed}
+    return {str(number): " ".join(str(name).lower().split()) for number, name in listed}

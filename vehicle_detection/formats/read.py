@@ -19,7 +19,15 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._common import Limit, check, check_regular_file, describe, import_pyarrow, shorten
+from vehicle_detection._common import (
+    Limit,
+    check,
+    check_regular_file,
+    describe,
+    import_pyarrow,
+    parse_number,
+    shorten,
+)
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import DatasetError
@@ -46,7 +54,6 @@ from vehicle_detection.tables import (
     check_classes,
     frame_order,
     parse_cells,
-    parse_number,
 )
 from vehicle_detection.tracking import UNKNOWN_LABEL
 
@@ -400,8 +407,9 @@ def _table_of(
 ) -> TrackTable:
     """Check the rows of any format, clip their boxes to `shape`, and return them as a table."""
     # Tables are filtered by class here; other formats have been, and may have ignored boxes of other classes.
-    labels = None if kind in ("csv", "jsonl", "parquet") else found.cells.pop("label", None)
-    columns, places = parse_cells(found.cells, source, found.places, classes)
+    is_table = kind in ("csv", "jsonl", "parquet")
+    labels = None if is_table else found.cells.pop("label", None)
+    columns, places = parse_cells(found.cells, source, found.places, classes if is_table else None)
     if labels is not None and {*labels} - {None, UNKNOWN_LABEL}:
         columns["label"] = [label or UNKNOWN_LABEL for label in labels]
     boxes, labelled = columns["boxes"], "score" not in columns
