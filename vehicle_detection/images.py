@@ -80,7 +80,8 @@ def image_size(data: bytes) -> tuple[int, int] | None:
         file = io.BytesIO(data)
         if _TIFF.match(data):  # the tags only: Pillow knows fewer kinds of pixels
             tags = _tiff_tags(data)
-            return int(tags[256]), int(tags[257])
+            size = int(tags[256]), int(tags[257])
+            return size[::-1] if tags.get(274, 1) > 4 else size  # turned by a quarter when it is decoded
         for magic, reader in _HEADERS.items():
             if re.match(magic, data, re.DOTALL):
                 module, name = reader.split(".")

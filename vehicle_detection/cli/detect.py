@@ -122,7 +122,7 @@ def _expand(text: str) -> list[_Image]:
     refuse_if(not text.strip(), "IMAGE must be a file, a folder or a URL, got an empty name")
     path = common.check.path(text, "IMAGE", kind="an image file")
     if common.is_url(text):
-        return [_Image(text, path.name.partition("?")[0] or "image")]
+        return [_Image(text, Path(common.without_query(text)).name or "image")]
     has_pattern = ("*" in text or "?" in text) and not path.exists()
     if not path.is_dir() and not has_pattern:
         return [_Image(path, path.name)]
