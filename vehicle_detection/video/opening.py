@@ -25,7 +25,7 @@ from vehicle_detection.video.ffmpeg import (
 )
 from vehicle_detection.video.files import check_file, download, is_video_file, list_files
 from vehicle_detection.video.live import LiveStream
-from vehicle_detection.video.probe import VideoInfo, joined_length, probe
+from vehicle_detection.video.probe import VideoInfo, joined_length, probe, with_repeats
 from vehicle_detection.video.reading import FrameReader, check_span, frame_range
 from vehicle_detection.video.sources import (
     NO_RATE,
@@ -135,7 +135,7 @@ class _Options:
 
     def probe(self, path: Path | str) -> VideoInfo:
         """Read the properties of a file or URL, and apply the options to it."""
-        return self.apply(path, probe(path, self.stream))
+        return self.apply(path, with_repeats(path, probe(path, self.stream)))
 
     def apply(self, path: Path | str, info: VideoInfo) -> VideoInfo:
         """Return the properties with the frame rate of the options, if the file has no times."""

@@ -315,6 +315,18 @@ def joined_length(path: Path, info: VideoInfo) -> float:
     return length if length > info.duration + _JOINED_SECONDS else 0.0
 
 
+def with_repeats(path: Path | str, info: VideoInfo) -> VideoInfo:
+    """Return the properties of an AVI file, with a varying rate if it has empty frames, which repeat others.
+
+    ffmpeg leaves them out, so that the times have gaps. Times of files with B-frames are unknown.
+    """
+    times = _frame_times(path, info.stream) if info.container == "avi" and info.constant_rate else []
+    if not times or times[0] < 0:
+        return info
+    fps, constant = _rate_of_times(info.fps, times)
+    return replace(info, fps=fps, constant_rate=constant)
+
+
 def _rate_of_first_frames(path: Path | str, stream: int) -> Fraction | None:
     """Frame rate by the times of the first decoded frames; None if they have none."""
     options = ("-map", f"0:{stream}", "-frames:v", "25", "-vf", "showinfo", "-f", "null", "-")
