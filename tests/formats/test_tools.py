@@ -39,6 +39,7 @@ def test_tracks_and_occlusion_in_coco(values, track, occluded, tmp_path):
 MOT_LABELS = {
     "MOT17": "1,1,11,21,30,40,1,3,0.8\n1,2,11,21,30,40,0,3,1",
     "spaces": "1 1 11 21 30 40 1 3 0.8\n1 2 11 21 30 40 0 3 1",
+    "VisDrone": "1,1,11,21,30,40,1,4,0,0\n1,2,11,21,30,40,0,4,1,2",
 }
 MOT_RESULTS = {
     "MOT": "1,1,11,21,30,40,0.9\n1,2,11,21,30,40,0.2",

@@ -231,22 +231,26 @@ def _mot_rows(
         record: Record = {"frame": int(frame) - 1, "track_id": track}
         record |= zip(CORNERS, (x, y, x + width, y + height))
         if labelled:
-            record["ignore"] = values[0] == 0
+            record |= {"ignore": values[0] == 0, "occluded": values[3] if len(values) == 4 else 0}
         else:
             record["score"] = values[0] if values else None
-        yield where, record, f"{values[1]:g}" if len(words) in (8, 9) and values[1] != -1 else None
+        has_class = (labelled or len(words) in (8, 9)) and values[1] != -1
+        yield where, record, f"{values[1]:g}" if has_class else None
 
 
 def _is_mot_label(words: list[str]) -> bool:
-    """Whether the last three of nine columns are those of ground truth: flag, class and visibility.
+    """Whether the last of nine or ten columns are those of ground truth: flag, class and visibility.
 
-    Trackers such as BoxMOT also write nine: confidence, class and -1.
+    VisDrone has truncation (0, 1) and occlusion (0 to 2) instead of the latter. Trackers such as BoxMOT also
+    write nine: confidence, class and -1.
     """
     try:
-        flag, number, visibility = map(float, words[6:])
-    except ValueError:  # fewer or more columns, or text
+        flag, number, *rest = map(float, words[6:])
+    except ValueError:  # fewer columns, or text
         return False
-    return flag in (0, 1) and number >= 0 and 0 <= visibility <= 1
+    if len(rest) == 2:
+        return flag in (0, 1) and number >= 0 and rest[0] in (0, 1) and rest[1] in (0, 1, 2)
+    return flag in (0, 1) and number >= 0 and len(rest) == 1 and 0 <= rest[0] <= 1
 
 
 def _read_mot_zip(source: Path, classes: Collection[str] | None) -> FileRows:
@@ -369,7 +373,8 @@ def read_labels(
     KITTI's ``DontCare`` and COCO's crowds become regions; trams, trailers and the like become ignored boxes,
     as do KITTI's other classes but persons, and its vehicles that are largely hidden, truncated by more than
     0.7 or narrower than 40 px, as in the project's labels. A MOT file is ground truth if all rows end with a
-    flag (0: ignored), a class and a visible fraction; in others column seven is the score.
+    flag (0: ignored), a class and a visible fraction, or truncation and occlusion as in VisDrone; in others
+    column seven is the score.
 
     Examples
     --------
