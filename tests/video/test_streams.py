@@ -296,7 +296,8 @@ def test_colors_are_unchanged_after_writing_and_reading(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [("truncated.mp4", ["-movflags", "+faststart", "-g", 10]), ("truncated.mkv", [])]
+    ("name", "options"),
+    [("cut.mp4", ["-movflags", "+faststart", "-g", 10]), ("cut.mkv", []), ("cut.avi", ["-c:v", "mjpeg"])],
 )
 def test_the_readable_part_of_an_incomplete_file_is_processed(truncated, tmp_path, name, options):
     source, target = truncated(name, *options), tmp_path / "out.mp4"

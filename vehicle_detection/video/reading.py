@@ -183,8 +183,10 @@ class FrameReader(Reader):
         incomplete = ""
         if self._count is None or self.frames_read < self._count:
             check_resources(name, code, log)
-            if end < self.info.frames - 1 and _TRUNCATED.search(log):
-                known = f"{end} of about {self.info.frames} frames" if self.frames_read else ""
+            cut = _TRUNCATED.search(log)
+            announced = self.info.frames if cut else _frames_of_cut_avi(self._path, self.info)
+            if end < announced - 1:
+                known = f"{end} of about {announced} frames" if self.frames_read else ""
                 incomplete = f"{name} is incomplete: {known or f'no frame after {start:g} s'} can be decoded"
             elif code:
                 message = (
@@ -280,6 +282,19 @@ def find_damage(path: Path | str, info: VideoInfo, end: int, log: str, *, stop: 
     if count:
         parts.append(f"ffmpeg reports {pluralize(count, 'decoding error')} ({message})")
     return f"{name} is damaged: {', and '.join(parts)}; copy or record it again" if parts else ""
+
+
+def _frames_of_cut_avi(path: Path | str, info: VideoInfo) -> int:
+    """Return the number of frames that an AVI file states, if its end is missing; otherwise 0.
+
+    ffmpeg reads such a file without an error.
+    """
+    if info.container != "avi" or isinstance(path, str):
+        return 0
+    with path.open("rb") as file:
+        header = file.read(52)
+    size, frames = (int.from_bytes(header[at : at + 4], "little") for at in (4, 48))
+    return frames if header[24:28] == b"avih" and size + 8 > path.stat().st_size else 0
 
 
 def _decode_errors(log: str) -> tuple[int, str]:
