@@ -123,9 +123,10 @@ def cvat_yolo(folder: Path, truth: Sequence[Box], rng: random.Random) -> Written
 
 
 def roboflow_yolo(folder: Path, truth: Sequence[Box], rng: random.Random) -> Written:
-    """YOLO of Roboflow and of Ultralytics' data sets: data.yaml, and labels beside images."""
+    """YOLO of Roboflow, of Ultralytics' data sets and of FiftyOne: a YAML file, and labels beside images."""
     listed = json.dumps(CLASSES if rng.random() < 0.5 else dict(enumerate(CLASSES)))
-    _write(folder / "data.yaml", f"train: ../train/images\nnc: 4\nnames: {listed}\n".replace('"', "'"), rng)
+    described = folder / rng.choice(("data.yaml", "dataset.yaml"))
+    _write(described, f"train: ../train/images\nnc: 4\nnames: {listed}\n".replace('"', "'"), rng)
     inner = folder / "train" / "labels"
     files = _yolo(inner, truth, rng, lambda box: ())
     return Written(
