@@ -505,7 +505,8 @@ class BandFilters:
     def _hog_maps(self, source: NDArray[Any]) -> list[NDArray[np.float32]]:
         """Compute the blocks of HOG and, if used, of coarse HOG; each ``(channels, rows, columns)``."""
         params, workspace = self.params, self._workspace
-        cells = kernels.hog_cells(source, params.orient, params.pix_per_cell, params.transform_sqrt)
+        options = params.orient, params.pix_per_cell, params.transform_sqrt
+        cells = kernels.hog_cells(source, *options, workspace)
         maps = [kernels.hog_blocks(cells, params.cell_per_block, 1, workspace)]
         if self.coarse:
             maps.append(kernels.hog_blocks(kernels.pool_cells(cells), params.cell_per_block, 2, workspace))
@@ -516,7 +517,8 @@ class BandFilters:
         cell, bins = self.params.pix_per_cell, self.bins_per_cell
         rows, columns = image.shape[0] // cell, image.shape[1] // cell
         count = 3 * bins**2 if self.params.spatial_feat else 0
-        channels = np.empty((count + self.hist_lookup, rows, columns), np.float32)
+        shape = count + self.hist_lookup, rows, columns
+        channels: NDArray[np.float32] = self._workspace.take(shape, np.float32, "values")
         if count:
             small = cv2.resize(image[: rows * cell, : columns * cell], (columns * bins, rows * bins))
             # (cell row, bin row, cell column, bin column, color) to (color, bin row, bin column, cells)

@@ -56,14 +56,17 @@ def sqrt_gradients(image: NDArray[np.uint8 | np.floating]) -> tuple[NDArray[np.f
     return gx, gy, np.arctan2(gy, gx)
 
 
-def hog_cells(image: NDArray[Any], orient: int, cell: int, transform_sqrt: bool) -> NDArray[np.float32]:
+def hog_cells(
+    image: NDArray[Any], orient: int, cell: int, transform_sqrt: bool, workspace: Workspace = NEW_ARRAYS
+) -> NDArray[np.float32]:
     """Orientation histograms of an image's cells: ``(channels, orient, rows, columns)``.
 
     Equals the first stage of scikit-image's HOG; `image` is ``(H, W, channels)``, uint8 or float.
     Without `transform_sqrt`, a gradient of floats exactly on a bound of bins may fall into the other one.
     """
     height, width, channels = image.shape
-    cells = np.empty((channels, orient, height // cell, width // cell), np.float32)
+    shape = channels, orient, height // cell, width // cell
+    cells: NDArray[np.float32] = workspace.take(shape, np.float32, "cells")
     if transform_sqrt:
         if image.dtype != np.uint8 and image.min() < 0:
             raise InvalidInputError(
@@ -72,30 +75,31 @@ def hog_cells(image: NDArray[Any], orient: int, cell: int, transform_sqrt: bool)
             )
         sum_orientations(*sqrt_gradients(image), degree_bounds(orient), channels, cell, cells)
     else:
-        _sum_magnitudes(image, cell, cells)
+        _sum_magnitudes(image, cell, cells, workspace)
     return cells
 
 
 # Values of a row that are processed together: a multiple of 64, which vectors divide without rest. The rows
 # of their gradients and sums stay in the first cache.
-_TILE = 384
+_TILE = 576
 
 
-def _sum_magnitudes(image: NDArray[Any], cell: int, cells: NDArray[np.float32]) -> None:
+def _sum_magnitudes(image: NDArray[Any], cell: int, cells: NDArray[np.float32], workspace: Workspace) -> None:
     """Fill `cells` with the gradient magnitudes of an image that is not square-rooted."""
-    _, width, channels = image.shape
+    height, width, channels = image.shape
     orient = cells.shape[1]
     # Mirrored: the gradient at the image's border is zero.
-    bordered = cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REFLECT_101).ravel()
+    memory = workspace.take((height + 2, width + 2, channels), image.dtype, "bordered")
+    bordered = cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REFLECT_101, memory).ravel()
     bounds = orientation_cotangents(orient)
-    size = max(1, _TILE // (cell * channels)) * cell * channels
-    gradients, sums, fours = (np.empty((n, size), np.float32) for n in (2, orient, orient))
-    stride = (width + 2) * channels
-    sum_magnitudes(bordered, stride, channels, cell, bounds, *gradients, sums, fours, cells)
+    columns = max(1, _TILE // (cell * channels))
+    values, sums = (np.empty((n, columns * cell * channels), np.float32) for n in (3, orient))
+    past, stride = np.empty((channels, columns), np.float32), (width + 2) * channels
+    sum_magnitudes(bordered, stride, channels, cell, bounds, *values, sums, past, cells)
 
 
 @jit
-def sum_magnitudes(image, stride, channels, cell, bounds, quotients, magnitudes, sums, fours, cells):
+def sum_magnitudes(image, stride, channels, cell, bounds, quotients, magnitudes, fours, sums, past, cells):
     """Sum gradient magnitudes into the orientation histograms of cells.
 
     `image` is flat, with a border of a pixel and `stride` values in a row, `cell` the side of a cell in
@@ -130,30 +134,40 @@ def sum_magnitudes(image, stride, channels, cell, bounds, quotients, magnitudes,
                     quotients[i] = gx / gy if gy != zero else np.float32(np.inf)
                     magnitudes[i] = magnitude
                     total[i] += magnitude
-                for k in range(1, orient):
+                # Four bounds at a time, so that a quotient is loaded once for four comparisons.
+                left_over = 1 + (orient - 1) // 4 * 4
+                for k in range(1, left_over, 4):
+                    b0, b1, b2, b3 = bounds[k], bounds[k + 1], bounds[k + 2], bounds[k + 3]
+                    w0, w1, w2, w3 = sums[k], sums[k + 1], sums[k + 2], sums[k + 3]
+                    for i in range(n):
+                        quotient, magnitude = quotients[i], magnitudes[i]
+                        w0[i] += magnitude if quotient <= b0 else zero
+                        w1[i] += magnitude if quotient <= b1 else zero
+                        w2[i] += magnitude if quotient <= b2 else zero
+                        w3[i] += magnitude if quotient <= b3 else zero
+                for k in range(left_over, orient):
                     bound, within = bounds[k], sums[k]
                     for i in range(n):
                         within[i] += magnitudes[i] if quotients[i] <= bound else zero
-            # Sums of four columns at every position: adjacent values, unlike the columns of a cell, are added
-            # as vectors.
-            source, parts, jump = sums, cell, one
-            if cell % 4 == 0:
-                source, parts, jump = fours, cell // 4, np.uintp(4 * channels)
-                for k in range(orient):
-                    within = sums[k]
+            past[:] = zero  # nothing is beyond the last bound
+            for k in range(orient - 1, -1, -1):
+                within, source, parts, jump = sums[k], sums[k], cell, one
+                # Sums of four columns at every position: adjacent values, unlike the columns of a cell, are
+                # added as vectors.
+                if cell % 4 == 0:
+                    source, parts, jump = fours, cell // 4, np.uintp(4 * channels)
                     for i in range(np.uintp(n) - three):
-                        fours[k, i] = (within[i] + within[i + one]) + (within[i + two] + within[i + three])
-            for column in range(n // span):
+                        fours[i] = (within[i] + within[i + one]) + (within[i + two] + within[i + three])
                 for channel in range(channels):
-                    past = zero  # nothing is beyond the last bound
-                    for k in range(orient - 1, -1, -1):
+                    out, beyond = cells[channel, k, row, start // span :], past[channel]
+                    for column in range(n // span):
                         at = np.uintp(column * span + channel)
-                        part = source[k, at]
+                        part = source[at]
                         for _ in range(1, parts):
                             at += jump
-                            part += source[k, at]
-                        cells[channel, k, row, start // span + column] = (part - past) * scale
-                        past = part
+                            part += source[at]
+                        out[column] = (part - beyond[column]) * scale
+                        beyond[column] = part
 
 
 @jit
@@ -224,7 +238,8 @@ def hog_blocks(
     flat = cells.reshape(channels, orient, -1)
     offsets = [(i * columns + j) * dilation for i in range(block) for j in range(block)]
     count = max(0, rows * columns - offsets[-1])
-    energy = np.add.reduce(flat * flat, axis=1)
+    memory = workspace.take(flat.shape, np.float32, "squares")
+    energy = np.add.reduce(np.multiply(flat, flat, out=memory), axis=1)
     squares = np.full((channels, count), 1e-10, np.float32)
     for offset in offsets:
         squares += energy[:, offset : offset + count]
@@ -378,9 +393,6 @@ def add_correlation(
     `scores` has a row and a column for each position of the window. Neighboring cells of a window are
     `dilation` cells apart.
     """
-    if missing := -len(channels) % 4:
-        channels = np.concatenate([channels, np.zeros((missing, *channels.shape[1:]), np.float32)])
-        weights = np.pad(weights, ((0, 0), (0, 0), (0, missing)))
     (height, width), columns = scores.shape, channels.shape[2]
     if not scores.size:
         return
@@ -397,15 +409,16 @@ _POSITIONS = 1024
 
 @functools.partial(jit, reorder=True)
 def correlate(channels, weights, columns, dilation, sums):
-    """Add the correlation of a number of channels that is a multiple of 4; see `add_correlation`.
+    """Add the correlation of channels with weights; see `add_correlation`.
 
     `channels` is ``(channels, cells)``, with rows of `columns` cells one after the other, and `sums` has a
     value for each cell at which a window starts. Four channels are added at a time, so that a sum is loaded
-    and stored once for four products.
+    and stored once for four products, and those that are left one by one.
     """
+    fours = len(channels) // 4 * 4
     for start in range(0, len(sums), _POSITIONS):
         out = sums[start : start + _POSITIONS]
-        for k in range(0, channels.shape[0], 4):
+        for k in range(0, fours, 4):
             for row in range(weights.shape[0]):
                 for column in range(weights.shape[1]):
                     cell, w = start + (row * columns + column) * dilation, weights[row, column, k:]
@@ -414,3 +427,10 @@ def correlate(channels, weights, columns, dilation, sums):
                     v2, v3 = channels[k + 2, cell:], channels[k + 3, cell:]
                     for i in range(len(out)):
                         out[i] += (w0 * v0[i] + w1 * v1[i]) + (w2 * v2[i] + w3 * v3[i])
+        for k in range(fours, len(channels)):
+            for row in range(weights.shape[0]):
+                for column in range(weights.shape[1]):
+                    values = channels[k, start + (row * columns + column) * dilation :]
+                    weight = weights[row, column, k]
+                    for i in range(len(out)):
+                        out[i] += weight * values[i]
