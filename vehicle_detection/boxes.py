@@ -6,9 +6,11 @@ without ``check_`` in their body are for arrays that were checked.
 
 from __future__ import annotations
 
+import logging
 import math
+import re
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -18,8 +20,18 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import Floats, check, describe, fields, invalid, pluralize
 from vehicle_detection.errors import InvalidInputError
 
+_LOGGER = logging.getLogger(__name__)
+
 if TYPE_CHECKING:
     import pandas
+
+VEHICLE_CLASSES = ("car", "van", "truck", "bus", "vehicle")
+"""Names of the classes that are vehicles by default, of labels and of networks."""
+
+# The last word of other names that are those of vehicles.
+_VEHICLE = re.compile(
+    "(car|van|truck|bus|vehicle|suv|pickup|taxi|sedan|hatchback|minivan|minibus)s?|buses|lorry|lorries"
+)
 
 ScoreScale = Literal["probability", "logit"] | tuple[float, float]
 """What the scores of another detector are: see `log_odds`."""
@@ -481,3 +493,17 @@ class Platt(fields.Checked):
 
 LOG_ODDS = Platt(-1.0, 0.0)
 """Probability of a score that is a log-odds value: 0 is 50%."""
+
+
+def warn_of_vehicles(source: str, found: Iterable[str], read: Iterable[str]) -> None:
+    """Warn of classes that are not read, but seem to be vehicles by their last word: "big truck", "bus-l"."""
+    words = {
+        name: [word for word in re.split("[^a-z]+", name) if len(word) > 2] for name in {*found} - {*read}
+    }
+    others = sorted(name for name, each in words.items() if each and _VEHICLE.fullmatch(each[-1]))
+    if others:
+        _LOGGER.warning(
+            "%s: vehicles of class %s are left out; classes= selects all classes of vehicles",
+            source,
+            ", ".join(others[:9]),
+        )

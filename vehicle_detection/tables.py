@@ -21,9 +21,14 @@ from vehicle_detection._common import (
     parse_number,
     pluralize,
     shorten,
+)
+from vehicle_detection.boxes import (
+    TABLE_COLUMNS,
+    VEHICLE_CLASSES,
+    Detections,
+    confidence_score,
     warn_of_vehicles,
-)  # fmt: skip
-from vehicle_detection.boxes import TABLE_COLUMNS, Detections, confidence_score
+)
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.tracking import TRACK_VALUES, UNKNOWN_LABEL, is_result, shown_tracks
 
@@ -41,9 +46,8 @@ TRACK_COLUMNS = (*BOX_COLUMNS[:-1], *TRACK_VALUES)
 """Columns of a table of tracks, in the order of the files."""
 LABEL_COLUMNS = ("occluded", "truncated", "ignore")
 
-VEHICLE_CLASSES = ("car", "van", "truck", "bus", "vehicle")
 LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autorickshaw", "vehicle fallback")
-"""Classes whose boxes are vehicles by default, and classes whose labels are ignored."""
+"""Classes whose labels are ignored boxes."""
 _CLASS_COLUMNS = ("class", "label", "category")
 _OWN_COLUMNS = ({"score", "confidence", "label"}, {"track_id", "label", *LABEL_COLUMNS})  # of written files
 

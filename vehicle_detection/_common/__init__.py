@@ -32,7 +32,6 @@ from vehicle_detection._common.text import (
     pluralize,
     spreadsheet_text,
     stable_url,
-    warn_of_vehicles,
     without_query,
 )
 from vehicle_detection._common.threads import (

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import re
-from collections.abc import Iterable
 from typing import Any
 from urllib.parse import unquote_plus
 
@@ -13,8 +11,6 @@ import numpy as np
 
 from vehicle_detection._common.check import describe
 from vehicle_detection.errors import DatasetError
-
-_LOGGER = logging.getLogger(__name__)
 
 _URL = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://")
 _FILE_URL = re.compile("file://(localhost(?=/))?", re.IGNORECASE)
@@ -44,24 +40,6 @@ _SIGNATURE = re.compile(
     r"x-(amz|goog)-.*|awsaccesskeyid|googleaccessid|expires|signature|key-pair-id|policy", re.IGNORECASE
 )
 _AZURE = re.compile(r"sig|s[eprstv]|srt|spr|sip|sdd|sk(oid|tid|[estv])|saoid|suoid|scid", re.IGNORECASE)
-
-_VEHICLE = re.compile(
-    "(car|van|truck|bus|vehicle|suv|pickup|taxi|sedan|hatchback|minivan|minibus)s?|buses|lorry|lorries"
-)
-
-
-def warn_of_vehicles(source: str, found: Iterable[str], read: Iterable[str]) -> None:
-    """Warn of classes that are not read, but seem to be vehicles by their last word: "big truck", "bus-l"."""
-    words = {
-        name: [word for word in re.split("[^a-z]+", name) if len(word) > 2] for name in {*found} - {*read}
-    }
-    others = sorted(name for name, each in words.items() if each and _VEHICLE.fullmatch(each[-1]))
-    if others:
-        _LOGGER.warning(
-            "%s: vehicles of class %s are left out; classes= selects all classes of vehicles",
-            source,
-            ", ".join(others[:9]),
-        )
 
 
 def parse_number(cell: Any, name: str, place: str) -> float:

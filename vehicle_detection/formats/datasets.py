@@ -22,7 +22,7 @@ from vehicle_detection._common import (
     parse_yaml,
     read_regular_file,
 )
-from vehicle_detection.boxes import clip_boxes, confidence_score
+from vehicle_detection.boxes import VEHICLE_CLASSES, clip_boxes, confidence_score
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.formats.rows import (
@@ -45,7 +45,6 @@ from vehicle_detection.tables import (
     LOOKALIKE_CLASSES,
     NO_TRACK,
     TRACK_COLUMNS,
-    VEHICLE_CLASSES,
     FrameKey,
     TrackTable,
     check_classes,
@@ -158,9 +157,8 @@ def read_coco(
         try:
             x, y, width, height = (parse_number(side, "bbox", where) for side in entry["bbox"])
             category = entry["category_id"]
-            image = entry[
-                "image_id"
-            ]  # Ultralytics writes the file's name, or its number, which may be another id
+            # Ultralytics writes the file's name, or its number, which may be another id.
+            image = entry["image_id"]
             named = by_name.get(_base_name(entry.get("file_name", "" if image in file.images else image)))
             frame = file.images[image] if named is None else named
             name = file.categories[category]
@@ -411,7 +409,7 @@ def _yolo_record(where: str, words: list[str], shape: tuple[int, ...]) -> tuple[
         expected = "class, center and size, and perhaps confidence and track"
         raise DatasetError(f"{where}: expected {expected}, found {len(words)} values{outline}")
     x, y, width, height = (parse_number(word, "side of the box", where) for word in words[1:5])
-    if not all(-0.1 <= side <= 1.1 for side in (x, y, width, height)):
+    if min(width, height) < 0 or not all(-0.1 <= side <= 1.1 for side in (x, y, width, height)):
         reason = "lies outside the image; center and size are fractions of the image in YOLO"
         raise DatasetError(f"{where}: the box {' '.join(words[1:5])} {reason}")
     x, width, y, height = x * shape[1], width * shape[1], y * shape[0], height * shape[0]

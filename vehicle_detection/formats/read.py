@@ -28,7 +28,7 @@ from vehicle_detection._common import (
     parse_number,
     shorten,
 )
-from vehicle_detection.boxes import clip_boxes
+from vehicle_detection.boxes import VEHICLE_CLASSES, clip_boxes
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import DatasetError
 from vehicle_detection.formats.datasets import json_reason, read_coco, read_yolo
@@ -48,7 +48,6 @@ from vehicle_detection.tables import (
     CORNERS,
     LABEL_COLUMNS,
     NO_TRACK,
-    VEHICLE_CLASSES,
     FrameKey,
     TrackTable,
     check_classes,
@@ -91,6 +90,7 @@ def _read_csv(source: Path, classes: Collection[str] | None) -> FileRows:
     twice = sorted({name for name in (*BOX_COLUMNS, *_LABELS, *LABEL_COLUMNS) if names.count(name) > 1})
     if twice:
         raise DatasetError(f"{source} has the column {', '.join(twice)} more than once; keep one of each")
+    # Before the lines: those of a table without a header may differ in length.
     _check_columns(source, FileRows([], {name: [] for name in names}))
     lines = [(number, line) for number, line in lines[1:] if any(cell.strip() for cell in line)]
     for number, line in lines:

@@ -1,6 +1,6 @@
 """Networks in ONNX files: the shipped one, and those of other detectors."""
 
-from vehicle_detection.network.loading import FORMAT_VERSION, METADATA_KEY, VEHICLE_CLASSES, load_network
+from vehicle_detection.network.loading import FORMAT_VERSION, METADATA_KEY, load_network
 from vehicle_detection.network.model import NetworkModel, NetworkParams, NetworkSearch
 from vehicle_detection.network.runtime import Device, GraphFacts, Session, open_session, read_facts
 from vehicle_detection.network.tensors import Candidates, InputFormat, OutputFormat, fit_input
@@ -8,7 +8,6 @@ from vehicle_detection.network.tensors import Candidates, InputFormat, OutputFor
 __all__ = [
     "FORMAT_VERSION",
     "METADATA_KEY",
-    "VEHICLE_CLASSES",
     "Candidates",
     "Device",
     "GraphFacts",

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Limit, check, invalid, read_regular_file, warn_of_vehicles
-from vehicle_detection.boxes import logit
+from vehicle_detection._common import Limit, check, invalid, read_regular_file
+from vehicle_detection.boxes import VEHICLE_CLASSES, logit, warn_of_vehicles
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.network.model import INPUT_SIZE, NetworkModel, NetworkParams
 from vehicle_detection.network.runtime import (
@@ -42,9 +42,6 @@ METADATA_KEY = "vehicle_detection"
 
 FORMAT_VERSION = 1
 """Version of that JSON."""
-
-VEHICLE_CLASSES = ("car", "truck", "bus", "van", "vehicle")
-"""Names of the classes that count as vehicles by default."""
 
 # Side of the input on which a network without fixed sizes is tried once.
 _PROBE_SIZE = 320
