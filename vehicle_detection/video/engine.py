@@ -17,6 +17,7 @@ from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Protocol, Self
 from weakref import WeakValueDictionary
 
@@ -144,7 +145,7 @@ class _QueuedFrame:
     time: float
     frame: DecodedFrame | None  # None if nobody asked for it
     cut: bool  # whether it begins another scene
-    search: Future[tuple[Any, float]] | None  # None: the frame is not searched
+    search: SimpleQueue[Future[Any]] | None  # gets the search when it is done; None: not searched
     dropped: int = 0  # frames that a live source dropped before this one
 
 
@@ -251,8 +252,9 @@ class _Pipeline:
             if expected is None or dropped or cut or skipped >= self.interval:
                 if self.reduction == 1:  # once for the search and for drawing
                     frame = DecodedFrame(frame.rgb())
-                search, skipped = self._pool.submit(self._search, frame), 0
-                running.append(search)
+                search, skipped = SimpleQueue[Future[Any]](), 0
+                running.append(self._pool.submit(self._search, frame))
+                running[-1].add_done_callback(search.put)
             kept = frame if self.frames else None
             self._queue.put(_QueuedFrame(moment, kept, cut, search, dropped))
             del frame, kept
@@ -295,7 +297,7 @@ class _Pipeline:
         """Track a searched frame, the last one of a block of `frames`."""
         assert item.search is not None
         try:
-            found, seconds = item.search.result()
+            found, seconds = item.search.get().result()  # does not wait: see `ClosableQueue`
         except DetectorError as error:
             raise DetectorError(f"at {item.time:.2f} s: {error}") from error
         self.searching += seconds

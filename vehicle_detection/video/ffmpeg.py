@@ -17,7 +17,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,6 +28,7 @@ from vehicle_detection._common import (
     NETWORK_TIMEOUT,
     REFUSED,
     Limit,
+    call_in_thread,
     hide_credentials,
     is_web_address,
     web_proxy,
@@ -184,13 +185,20 @@ class _Starter:
 
     def start(self, command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
         """Start a process, which is killed when Python ends in whatever way."""
-        with self._lock:
-            self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="ffmpeg-starter")
-            future = self._pool.submit(self._start, command, options)
+        started: list[Future[subprocess.Popen[bytes]]] = []
+
+        def start() -> None:
+            with self._lock:
+                self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="ffmpeg-starter")
+                started.append(self._pool.submit(self._start, command, options))
+            wait(started)
+
         try:
-            return future.result()
+            call_in_thread(start)
+            return started[0].result()
         except BaseException:  # also KeyboardInterrupt: nobody else knows the process
-            future.add_done_callback(_kill_started)
+            for future in started:
+                _kill_started(future)
             raise
 
     @staticmethod
