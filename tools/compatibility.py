@@ -19,7 +19,7 @@ RESOLUTIONS = {"oldest": "lowest-direct", "newest": "highest"}
 TESTS = (
     "tests/test_features.py", "tests/test_search.py", "tests/test_boxes.py", "tests/test_heatmap.py",
     "tests/test_images.py", "tests/test_svm.py", "tests/test_detector.py", "tests/network",
-    "tests/tracking", "tests/formats", "tests/test_sklearn_models.py", "tests/video/test_writing.py",
+    "tests/tracking", "tests/datasets", "tests/test_sklearn_models.py", "tests/video/test_writing.py",
     "tests/cli/test_app.py",
 )  # fmt: skip
 """Tests of the parts that depend most on other libraries."""

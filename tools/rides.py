@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from vehicle_detection.formats import read_labels
+from vehicle_detection.datasets import read_labels
 
 _FIRST = 557
 """Rides at the beginning of the labels, half of which were picked for their content."""

@@ -3,7 +3,18 @@ from .annotator import Annotator, DrawParams, draw_diagnostics, draw_tracks
 from .boxes import Detections, clip_boxes, iou_matrix, non_max_suppression
 from .camera import Camera, open_camera, read_camera, write_camera
 from .course import HeatmapDetector, bin_spatial, color_hist, draw_labeled_bboxes, get_hog_features
-from .datasets import FrameSet, PatchSet, fetch_patches, load_frames, load_patches, load_training_patches
+from .datasets import (
+    FrameSet,
+    PatchSet,
+    fetch_patches,
+    load_frames,
+    load_patches,
+    load_training_patches,
+    open_tracks,
+    read_labels,
+    write_labels,
+    write_tracks,
+)
 from .detector import Detector, VehicleDetector, detect, load_model
 from .drawing import blur_boxes, draw_boxes, draw_detections
 from .drive import (
@@ -33,7 +44,6 @@ from .features import (
     extract_features,
     single_img_features,
 )
-from .formats import open_tracks, read_labels, write_labels, write_tracks
 from .function_model import FunctionParams, detector_from
 from .heatmap import HeatHistory, HeatParams, add_heat, apply_threshold, bounding_boxes, label_boxes
 from .images import read_image, write_image

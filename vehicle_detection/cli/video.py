@@ -264,7 +264,7 @@ def _check_run(options: VideoOptions, source: FrameSource, detector: vd.VehicleD
 def _check(options: VideoOptions) -> None:
     """Refuse options that do not fit each other, and a run without any output."""
     from vehicle_detection.camera import LENSES
-    from vehicle_detection.formats import FORMATS
+    from vehicle_detection.datasets import FORMATS
 
     files = options.files()
     sources = {"SOURCE": Path(options.source)} | ({} if options.gpx is None else {"--gpx": options.gpx})

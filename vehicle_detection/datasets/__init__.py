@@ -1,4 +1,7 @@
-"""Training patches and frames: reading, download, splits and near duplicates; listed in ``__init__.pyi``."""
+"""Training patches and frames: reading, download, splits and near duplicates; and files of tracks and labels.
+
+Names are listed in ``__init__.pyi`` and imported on first use, as those of the package.
+"""
 
 import lazy_loader
 

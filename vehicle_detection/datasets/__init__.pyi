@@ -6,6 +6,9 @@ from .patches import PatchSet as PatchSet
 from .patches import check_labels as check_labels
 from .patches import load_patches as load_patches
 from .patches import load_training_patches as load_training_patches
+from .reading import FORMATS as FORMATS
+from .reading import read_labels as read_labels
+from .rows import without_suffix as without_suffix
 from .splits import SEEDED_SPLITS as SEEDED_SPLITS
 from .splits import SPLIT_NAMES as SPLIT_NAMES
 from .splits import Split as Split
@@ -18,3 +21,8 @@ from .splits import split_leakage as split_leakage
 from .splits import split_random as split_random
 from .splits import split_sequences as split_sequences
 from .splits import split_sources as split_sources
+from .writing import DIGITS as DIGITS
+from .writing import open_tracks as open_tracks
+from .writing import track_records as track_records
+from .writing import write_labels as write_labels
+from .writing import write_tracks as write_tracks

@@ -36,6 +36,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.annotator import Annotator
 from vehicle_detection.camera import open_camera
+from vehicle_detection.datasets import DIGITS, track_records
 from vehicle_detection.detector import VehicleDetector, load_model
 from vehicle_detection.drive.batch_store import (
     DONE,
@@ -53,7 +54,6 @@ from vehicle_detection.errors import (
     VehicleDetectionError,
     VideoError,
 )
-from vehicle_detection.formats import DIGITS, track_records
 from vehicle_detection.network import Device
 from vehicle_detection.video import (
     Encoding,

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import describe
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
+from vehicle_detection.datasets import without_suffix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.formats import without_suffix
 from vehicle_detection.tables import NO_TRACK, FrameKey, TrackTable, check_keys, frame_order
 
 _LOGGER = logging.getLogger(__name__)

@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check, describe
-from vehicle_detection.datasets import load_frames
+from vehicle_detection.datasets import load_frames, read_labels
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, match_names
-from vehicle_detection.formats import read_labels
 from vehicle_detection.tables import FrameKey, TrackTable
 from vehicle_detection.video import is_video_file, probe_video, read_frames
 

@@ -29,10 +29,9 @@ from vehicle_detection._common import (
     shorten,
 )
 from vehicle_detection.boxes import VEHICLE_CLASSES, clip_boxes
-from vehicle_detection.datasets import load_frames
-from vehicle_detection.errors import DatasetError
-from vehicle_detection.formats.datasets import json_reason, read_coco, read_yolo
-from vehicle_detection.formats.rows import (
+from vehicle_detection.datasets.coco_yolo import json_reason, read_coco, read_yolo
+from vehicle_detection.datasets.frames import load_frames
+from vehicle_detection.datasets.rows import (
     FRAME_NUMBER,
     FileRows,
     Record,
@@ -43,6 +42,7 @@ from vehicle_detection.formats.rows import (
     rows_of_records,
     warn_of_numbers,
 )
+from vehicle_detection.errors import DatasetError
 from vehicle_detection.tables import (
     BOX_COLUMNS,
     CORNERS,

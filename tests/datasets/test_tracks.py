@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vehicle_detection import Detections, InvalidInputError
-from vehicle_detection.formats import DIGITS, FORMATS, open_tracks, read_labels, write_tracks
+from vehicle_detection.datasets import DIGITS, FORMATS, open_tracks, read_labels, write_tracks
 from vehicle_detection.tables import BOX_COLUMNS, TRACK_COLUMNS, TrackTable
 
 ROWS = [

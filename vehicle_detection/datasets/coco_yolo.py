@@ -23,9 +23,8 @@ from vehicle_detection._common import (
     read_regular_file,
 )
 from vehicle_detection.boxes import VEHICLE_CLASSES, clip_boxes, confidence_score
-from vehicle_detection.datasets import FrameSet
-from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.formats.rows import (
+from vehicle_detection.datasets.frames import FrameSet
+from vehicle_detection.datasets.rows import (
     FRAME_NUMBER,
     ClassNumbers,
     FileRows,
@@ -39,6 +38,7 @@ from vehicle_detection.formats.rows import (
     warn_of_numbers,
     without_suffix,
 )
+from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import image_size, read_image
 from vehicle_detection.tables import (
     CORNERS,

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from vehicle_detection._common import Limit, read_regular_file, shorten
 from vehicle_detection.boxes import VEHICLE_CLASSES
-from vehicle_detection.datasets import is_image
+from vehicle_detection.datasets.archives import is_image
 from vehicle_detection.errors import DatasetError
 from vehicle_detection.tables import BOX_COLUMNS, FrameKey, frame_order
 from vehicle_detection.tracking import UNKNOWN_LABEL

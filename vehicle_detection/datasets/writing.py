@@ -28,8 +28,7 @@ from vehicle_detection._common import (
     temporary_folder,
 )
 from vehicle_detection.boxes import clip_boxes
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.formats.datasets import (
+from vehicle_detection.datasets.coco_yolo import (
     Truth,
     Write,
     open_coco,
@@ -37,8 +36,9 @@ from vehicle_detection.formats.datasets import (
     read_truth,
     without_noise,
 )
-from vehicle_detection.formats.read import FOLDER_FORMATS, FORMATS
-from vehicle_detection.formats.rows import FRAME_NUMBER, ClassNumbers, Record, without_suffix
+from vehicle_detection.datasets.reading import FOLDER_FORMATS, FORMATS
+from vehicle_detection.datasets.rows import FRAME_NUMBER, ClassNumbers, Record, without_suffix
+from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tables import BOX_COLUMNS, CORNERS, NO_TRACK, TRACK_COLUMNS, FrameKey, TrackTable
 from vehicle_detection.tracking import UNKNOWN_LABEL
 
