@@ -41,12 +41,12 @@ API_PAGES = (
     ("detect", "Detect and track", "detector results tracking boxes camera function_model"),
     ("video", "Video and drawing", "video annotator drawing images"),
     ("drive", "Events, reports and batches", "drive"),
-    ("tables", "Tables and files", "tables formats"),
+    ("datasets", "Tables, files and data sets", "tables datasets"),
     ("models", "Models and training", "network svm training"),
     ("explain", "Explain and explore", "notebook"),
     ("course_steps", "Features, windows and heat maps", "features windows search heatmap regions course"),
     ("evaluation", "Evaluation", "evaluation"),
-    ("datasets", "Data sets and rendered scenes", "datasets scenes"),
+    ("scenes", "Rendered scenes", "scenes"),
     ("errors", "Errors", "errors"),
 )
 SUBPACKAGE_NAMES = {
@@ -124,8 +124,10 @@ def read_section(text: str, title: str) -> str:
 def public_names() -> dict[str, list[str]]:
     """Return the public names by the module that defines them: ``__init__.pyi`` and `SUBPACKAGE_NAMES`."""
     tree = ast.parse((ROOT / "vehicle_detection/__init__.pyi").read_text())
-    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
-    names = {node.module or "": [alias.name for alias in node.names] for node in imports}
+    names: dict[str, list[str]] = {}
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom):
+            names.setdefault(node.module or "", []).extend(alias.name for alias in node.names)
     for module, others in SUBPACKAGE_NAMES.items():
         names[module] = [*names[module], *(f"{module}.{name}" for name in others.split())]
     return names

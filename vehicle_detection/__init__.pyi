@@ -1,182 +1,111 @@
-from . import course, datasets, drive, evaluation, notebook, tracking, training
-from .annotator import Annotator, DrawParams, draw_diagnostics, draw_tracks
-from .boxes import Detections, clip_boxes, iou_matrix, non_max_suppression
-from .camera import Camera, open_camera, read_camera, write_camera
-from .course import HeatmapDetector, bin_spatial, color_hist, draw_labeled_bboxes, get_hog_features
-from .datasets import (
-    FrameSet,
-    PatchSet,
-    fetch_patches,
-    load_frames,
-    load_patches,
-    load_training_patches,
-    open_tracks,
-    read_labels,
-    write_labels,
-    write_tracks,
-)
-from .detector import Detector, VehicleDetector, detect, load_model
-from .drawing import blur_boxes, draw_boxes, draw_detections
-from .drive import (
-    ReportWriter,
-    count_vehicles,
-    find_events,
-    open_trip,
-    read_own_speed,
-    run_batch,
-    write_events,
-    write_subtitles,
-)
-from .errors import (
-    DatasetError,
-    DetectorError,
-    InvalidInputError,
-    ModelFileError,
-    OutputError,
-    TransientVideoError,
-    VehicleDetectionError,
-    VideoError,
-)
-from .evaluation import LabelledFrames, evaluate_detections, evaluate_tracks, explain
-from .features import (
-    FeatureParams,
-    convert_color,
-    extract_features,
-    single_img_features,
-)
-from .function_model import FunctionParams, detector_from
-from .heatmap import HeatHistory, HeatParams, add_heat, apply_threshold, bounding_boxes, label_boxes
-from .images import read_image, write_image
-from .network import NetworkModel, NetworkParams
-from .notebook import Explorer
-from .regions import RegionParams, find_vehicles
-from .results import ImageDetections
-from .scenes import render_drive, render_patches, render_scene
-from .search import SearchBand, SearchParams
-from .svm import VehicleClassifier, load_classifier
-from .tables import TrackTable
-from .tracking import FrameResult, Track, Tracker, TrackParams, estimate_horizon
-from .training import TrainingOptions, train_and_evaluate, train_classifier
-from .video import (
-    VideoInfo,
-    annotate_clip,
-    open_source,
-    probe_video,
-    process_video,
-    read_frames,
-    track,
-    write_video,
-)
-from .windows import find_cars, search_windows, slide_window
+from . import course as course
+from . import datasets as datasets
+from . import drive as drive
+from . import evaluation as evaluation
+from . import notebook as notebook
+from . import tracking as tracking
+from . import training as training
+from .annotator import Annotator as Annotator
+from .annotator import DrawParams as DrawParams
+from .annotator import draw_diagnostics as draw_diagnostics
+from .annotator import draw_tracks as draw_tracks
+from .boxes import Detections as Detections
+from .boxes import clip_boxes as clip_boxes
+from .boxes import iou_matrix as iou_matrix
+from .boxes import non_max_suppression as non_max_suppression
+from .camera import Camera as Camera
+from .camera import open_camera as open_camera
+from .camera import read_camera as read_camera
+from .camera import write_camera as write_camera
+from .course import HeatmapDetector as HeatmapDetector
+from .course import bin_spatial as bin_spatial
+from .course import color_hist as color_hist
+from .course import draw_labeled_bboxes as draw_labeled_bboxes
+from .course import get_hog_features as get_hog_features
+from .datasets import FrameSet as FrameSet
+from .datasets import PatchSet as PatchSet
+from .datasets import fetch_patches as fetch_patches
+from .datasets import load_frames as load_frames
+from .datasets import load_patches as load_patches
+from .datasets import load_training_patches as load_training_patches
+from .datasets import open_tracks as open_tracks
+from .datasets import read_labels as read_labels
+from .datasets import write_labels as write_labels
+from .datasets import write_tracks as write_tracks
+from .detector import Detector as Detector
+from .detector import VehicleDetector as VehicleDetector
+from .detector import detect as detect
+from .detector import load_model as load_model
+from .drawing import blur_boxes as blur_boxes
+from .drawing import draw_boxes as draw_boxes
+from .drawing import draw_detections as draw_detections
+from .drive import ReportWriter as ReportWriter
+from .drive import count_vehicles as count_vehicles
+from .drive import find_events as find_events
+from .drive import open_trip as open_trip
+from .drive import read_own_speed as read_own_speed
+from .drive import run_batch as run_batch
+from .drive import write_events as write_events
+from .drive import write_subtitles as write_subtitles
+from .errors import DatasetError as DatasetError
+from .errors import DetectorError as DetectorError
+from .errors import InvalidInputError as InvalidInputError
+from .errors import ModelFileError as ModelFileError
+from .errors import OutputError as OutputError
+from .errors import TransientVideoError as TransientVideoError
+from .errors import VehicleDetectionError as VehicleDetectionError
+from .errors import VideoError as VideoError
+from .evaluation import LabelledFrames as LabelledFrames
+from .evaluation import evaluate_detections as evaluate_detections
+from .evaluation import evaluate_tracks as evaluate_tracks
+from .evaluation import explain as explain
+from .features import FeatureParams as FeatureParams
+from .features import convert_color as convert_color
+from .features import extract_features as extract_features
+from .features import single_img_features as single_img_features
+from .function_model import FunctionParams as FunctionParams
+from .function_model import detector_from as detector_from
+from .heatmap import HeatHistory as HeatHistory
+from .heatmap import HeatParams as HeatParams
+from .heatmap import add_heat as add_heat
+from .heatmap import apply_threshold as apply_threshold
+from .heatmap import bounding_boxes as bounding_boxes
+from .heatmap import label_boxes as label_boxes
+from .images import read_image as read_image
+from .images import write_image as write_image
+from .network import NetworkModel as NetworkModel
+from .network import NetworkParams as NetworkParams
+from .notebook import Explorer as Explorer
+from .regions import RegionParams as RegionParams
+from .regions import find_vehicles as find_vehicles
+from .results import ImageDetections as ImageDetections
+from .scenes import render_drive as render_drive
+from .scenes import render_patches as render_patches
+from .scenes import render_scene as render_scene
+from .search import SearchBand as SearchBand
+from .search import SearchParams as SearchParams
+from .svm import VehicleClassifier as VehicleClassifier
+from .svm import load_classifier as load_classifier
+from .tables import TrackTable as TrackTable
+from .tracking import FrameResult as FrameResult
+from .tracking import Track as Track
+from .tracking import Tracker as Tracker
+from .tracking import TrackParams as TrackParams
+from .tracking import estimate_horizon as estimate_horizon
+from .training import TrainingOptions as TrainingOptions
+from .training import train_and_evaluate as train_and_evaluate
+from .training import train_classifier as train_classifier
+from .video import VideoInfo as VideoInfo
+from .video import annotate_clip as annotate_clip
+from .video import open_source as open_source
+from .video import probe_video as probe_video
+from .video import process_video as process_video
+from .video import read_frames as read_frames
+from .video import track as track
+from .video import write_video as write_video
+from .windows import find_cars as find_cars
+from .windows import search_windows as search_windows
+from .windows import slide_window as slide_window
 
+__all__: list[str]
 __version__: str
-__all__ = [
-    "Annotator",
-    "Camera",
-    "DatasetError",
-    "Detections",
-    "Detector",
-    "DetectorError",
-    "DrawParams",
-    "Explorer",
-    "FeatureParams",
-    "FrameResult",
-    "FrameSet",
-    "FunctionParams",
-    "HeatHistory",
-    "HeatParams",
-    "HeatmapDetector",
-    "ImageDetections",
-    "InvalidInputError",
-    "LabelledFrames",
-    "ModelFileError",
-    "NetworkModel",
-    "NetworkParams",
-    "OutputError",
-    "PatchSet",
-    "RegionParams",
-    "ReportWriter",
-    "SearchBand",
-    "SearchParams",
-    "Track",
-    "TrackParams",
-    "TrackTable",
-    "Tracker",
-    "TrainingOptions",
-    "TransientVideoError",
-    "VehicleClassifier",
-    "VehicleDetectionError",
-    "VehicleDetector",
-    "VideoError",
-    "VideoInfo",
-    "add_heat",
-    "annotate_clip",
-    "apply_threshold",
-    "bin_spatial",
-    "blur_boxes",
-    "bounding_boxes",
-    "clip_boxes",
-    "color_hist",
-    "convert_color",
-    "count_vehicles",
-    "course",
-    "datasets",
-    "detect",
-    "detector_from",
-    "draw_boxes",
-    "draw_detections",
-    "draw_diagnostics",
-    "draw_labeled_bboxes",
-    "draw_tracks",
-    "drive",
-    "estimate_horizon",
-    "evaluate_detections",
-    "evaluate_tracks",
-    "evaluation",
-    "explain",
-    "extract_features",
-    "fetch_patches",
-    "find_cars",
-    "find_events",
-    "find_vehicles",
-    "get_hog_features",
-    "iou_matrix",
-    "label_boxes",
-    "load_classifier",
-    "load_frames",
-    "load_model",
-    "load_patches",
-    "load_training_patches",
-    "non_max_suppression",
-    "notebook",
-    "open_camera",
-    "open_source",
-    "open_tracks",
-    "open_trip",
-    "probe_video",
-    "process_video",
-    "read_camera",
-    "read_frames",
-    "read_image",
-    "read_labels",
-    "read_own_speed",
-    "render_drive",
-    "render_patches",
-    "render_scene",
-    "run_batch",
-    "search_windows",
-    "single_img_features",
-    "slide_window",
-    "track",
-    "tracking",
-    "train_and_evaluate",
-    "train_classifier",
-    "training",
-    "write_camera",
-    "write_events",
-    "write_image",
-    "write_labels",
-    "write_subtitles",
-    "write_tracks",
-    "write_video",
-]

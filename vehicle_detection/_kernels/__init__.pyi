@@ -1,25 +1,10 @@
-from .features import (
-    add_correlation,
-    add_root_histograms,
-    bin_of_value,
-    count_bins,
-    find_bins,
-    histogram_cells,
-    hog_blocks,
-    hog_cells,
-    pool_cells,
-)
-from .linear_svm import fit_svm
-
-__all__ = [
-    "add_correlation",
-    "add_root_histograms",
-    "bin_of_value",
-    "count_bins",
-    "find_bins",
-    "fit_svm",
-    "histogram_cells",
-    "hog_blocks",
-    "hog_cells",
-    "pool_cells",
-]
+from .features import add_correlation as add_correlation
+from .features import add_root_histograms as add_root_histograms
+from .features import bin_of_value as bin_of_value
+from .features import count_bins as count_bins
+from .features import find_bins as find_bins
+from .features import histogram_cells as histogram_cells
+from .features import hog_blocks as hog_blocks
+from .features import hog_cells as hog_cells
+from .features import pool_cells as pool_cells
+from .linear_svm import fit_svm as fit_svm

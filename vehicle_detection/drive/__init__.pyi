@@ -1,42 +1,30 @@
-from .batch import BatchReport, run_batch
-from .batch_store import BatchStatus, batch_status, batch_summary, with_source
-from .counts import COUNTED, MinuteCounts, VehicleCounts, count_vehicles
-from .events import EVENT_COLUMNS, KINDS, Event, find_events
-from .outputs import EVENT_SUFFIXES, SUBTITLE_SUFFIXES, cut_clips, write_events, write_subtitles
-from .own_speed import OwnSpeed, own_speeds, read_own_speed
-from .report import ReportWriter, TrackPicture, explain_tracks
-from .trips import Trip, find_trips, open_trip, segment_clock
-from .worker_pool import open_dask
-
-__all__ = [
-    "COUNTED",
-    "EVENT_COLUMNS",
-    "EVENT_SUFFIXES",
-    "KINDS",
-    "SUBTITLE_SUFFIXES",
-    "BatchReport",
-    "BatchStatus",
-    "Event",
-    "MinuteCounts",
-    "OwnSpeed",
-    "ReportWriter",
-    "TrackPicture",
-    "Trip",
-    "VehicleCounts",
-    "batch_status",
-    "batch_summary",
-    "count_vehicles",
-    "cut_clips",
-    "explain_tracks",
-    "find_events",
-    "find_trips",
-    "open_dask",
-    "open_trip",
-    "own_speeds",
-    "read_own_speed",
-    "run_batch",
-    "segment_clock",
-    "with_source",
-    "write_events",
-    "write_subtitles",
-]
+from .batch import BatchReport as BatchReport
+from .batch import run_batch as run_batch
+from .batch_store import BatchStatus as BatchStatus
+from .batch_store import batch_status as batch_status
+from .batch_store import batch_summary as batch_summary
+from .batch_store import with_source as with_source
+from .counts import COUNTED as COUNTED
+from .counts import MinuteCounts as MinuteCounts
+from .counts import VehicleCounts as VehicleCounts
+from .counts import count_vehicles as count_vehicles
+from .events import EVENT_COLUMNS as EVENT_COLUMNS
+from .events import KINDS as KINDS
+from .events import Event as Event
+from .events import find_events as find_events
+from .outputs import EVENT_SUFFIXES as EVENT_SUFFIXES
+from .outputs import SUBTITLE_SUFFIXES as SUBTITLE_SUFFIXES
+from .outputs import cut_clips as cut_clips
+from .outputs import write_events as write_events
+from .outputs import write_subtitles as write_subtitles
+from .own_speed import OwnSpeed as OwnSpeed
+from .own_speed import own_speeds as own_speeds
+from .own_speed import read_own_speed as read_own_speed
+from .report import ReportWriter as ReportWriter
+from .report import TrackPicture as TrackPicture
+from .report import explain_tracks as explain_tracks
+from .trips import Trip as Trip
+from .trips import find_trips as find_trips
+from .trips import open_trip as open_trip
+from .trips import segment_clock as segment_clock
+from .worker_pool import open_dask as open_dask

@@ -1,48 +1,28 @@
-from .clips import annotate_clip
-from .engine import TrackRun, VideoDetector, VideoReport, track
-from .files import (
-    download,
-    is_video_file,
-    list_files,
-    open_filesystem,
-    select_videos,
-    walk_files,
-    with_retries,
-)
-from .horizon import estimate_video_horizon
-from .opening import Source, borrow_source, open_source, probe_video, read_frames
-from .probe import VideoInfo
-from .sources import FrameSource
-from .viewer import Viewer, open_viewer
-from .writing import PRESETS, Encoding, check_video_target, cut_video, process_video, write_video
-
-__all__ = [
-    "PRESETS",
-    "Encoding",
-    "FrameSource",
-    "Source",
-    "TrackRun",
-    "VideoDetector",
-    "VideoInfo",
-    "VideoReport",
-    "Viewer",
-    "annotate_clip",
-    "borrow_source",
-    "check_video_target",
-    "cut_video",
-    "download",
-    "estimate_video_horizon",
-    "is_video_file",
-    "list_files",
-    "open_filesystem",
-    "open_source",
-    "open_viewer",
-    "probe_video",
-    "process_video",
-    "read_frames",
-    "select_videos",
-    "track",
-    "walk_files",
-    "with_retries",
-    "write_video",
-]
+from .clips import annotate_clip as annotate_clip
+from .engine import TrackRun as TrackRun
+from .engine import VideoDetector as VideoDetector
+from .engine import VideoReport as VideoReport
+from .engine import track as track
+from .files import download as download
+from .files import is_video_file as is_video_file
+from .files import list_files as list_files
+from .files import open_filesystem as open_filesystem
+from .files import select_videos as select_videos
+from .files import walk_files as walk_files
+from .files import with_retries as with_retries
+from .horizon import estimate_video_horizon as estimate_video_horizon
+from .opening import Source as Source
+from .opening import borrow_source as borrow_source
+from .opening import open_source as open_source
+from .opening import probe_video as probe_video
+from .opening import read_frames as read_frames
+from .probe import VideoInfo as VideoInfo
+from .sources import FrameSource as FrameSource
+from .viewer import Viewer as Viewer
+from .viewer import open_viewer as open_viewer
+from .writing import PRESETS as PRESETS
+from .writing import Encoding as Encoding
+from .writing import check_video_target as check_video_target
+from .writing import cut_video as cut_video
+from .writing import process_video as process_video
+from .writing import write_video as write_video
