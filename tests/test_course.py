@@ -15,16 +15,18 @@ from sklearn.dummy import DummyClassifier
 from sklearn.linear_model import LogisticRegression, SGDClassifier
 from sklearn.model_selection import GridSearchCV
 from sklearn.naive_bayes import GaussianNB
+from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, MinMaxScaler, RobustScaler, StandardScaler
 from sklearn.svm import SVC, LinearSVC
 from sklearn.tree import DecisionTreeClassifier
 
 import vehicle_detection.course as lesson
 from tests import lesson_reference as reference
-from vehicle_detection import Detections, InvalidInputError, read_image, write_image
+from vehicle_detection import Detections, FeatureParams, InvalidInputError, read_image, write_image
 from vehicle_detection.course import search as search_module
 from vehicle_detection.scenes import render_patches, render_scene
 from vehicle_detection.svm import UNIT_CHANNELS
+from vehicle_detection.training import to_pipeline, train_classifier
 
 # Many tests use images of 0-1 with the lesson's default range of histograms.
 pytestmark = pytest.mark.filterwarnings("ignore:the image has values 0-1, which")
@@ -595,8 +597,6 @@ def test_a_star_import_brings_the_lesson_functions():
     for name, module in modules.items():
         found = names[name]
         assert getattr(found, "__module__", found.__name__) == module
-    with pytest.raises(AttributeError, match="plt"):
-        getattr(lesson, "plt")  # noqa: B009
 
 
 def test_what_the_lesson_accepts():
@@ -710,11 +710,6 @@ def test_bad_input_raises_an_error_of_the_library(call_data, models, form, messa
         eval(form, {**NAMES, "np": np, "StandardScaler": StandardScaler, "d": data})
 
 
-def test_an_unknown_option_names_the_function_that_was_called(models):
-    with pytest.raises(TypeError, match=r"find_cars\(\) got an unexpected keyword argument 'draw'"):
-        lesson.find_cars(FRAMES["uint8"], 0, 9, 1, *models["all", "uint8"].model, 9, 8, 2, 16, 16, draw=False)
-
-
 def test_features_of_an_image_with_a_picture_of_the_hog():
     features, picture = lesson.single_img_features(PATCHES[0], "YUV", hog_channel=1, vis=True)
     np.testing.assert_array_equal(features, lesson.single_img_features(PATCHES[0], "YUV", hog_channel=1))
@@ -770,5 +765,27 @@ def test_a_mismatch_warns_whatever_the_scaler_and_the_bins(options):
     options = {"color_space": "RGB", "spatial_size": (16, 16)} | options
     scaler = StandardScaler(with_std="spatial_size" not in options)
     svc, scaler = trained(np.array(lesson.extract_features(PATCHES / 255, **options)), scaler=scaler)
-    with pytest.warns(UserWarning, match="fitted on values 0-1"):
-        lesson.search_windows(FRAMES["uint8"], PAIRS, svc, scaler, **options)
+    for model in ((svc, scaler), (make_pipeline(scaler, svc), None)):
+        with pytest.warns(UserWarning, match="fitted on values 0-1"):
+            lesson.search_windows(FRAMES["uint8"], PAIRS, *model, **options)
+
+
+def test_a_model_of_the_library_needs_its_own_features():
+    model = train_classifier(PATCHES, LABELS, params=FeatureParams(spatial_order="interleaved"))
+    band, options = (FRAMES["uint8"], 60, 200, 1), (9, 8, 2, (16, 16), 32)
+    _, scaler, svc = to_pipeline(model).named_steps.values()
+    boxes = lesson.find_car_windows(*band, model, None, *options, divide_by=1)
+    assert boxes == lesson.find_car_windows(*band, svc, scaler, *options, divide_by=1) != []
+    with pytest.warns(UserWarning, match="fitted on values 0-255"):
+        lesson.find_car_windows(*band, model, None, *options)
+    for wrong, space in ((scaler, "YCrCb"), (None, "LUV")):
+        with pytest.raises(InvalidInputError, match=r"of its own features; HeatmapDetector\(model\)"):
+            lesson.find_car_windows(*band, model, wrong, *options, color_space=space, divide_by=1)
+    svc.classes_ = np.array(["notcar", "car"])  # the lesson looks for the label 1, and finds nothing
+    with pytest.raises(InvalidInputError, match=r"label 1 for vehicles .* got \['notcar', 'car'\]"):
+        lesson.find_car_windows(*band, svc, scaler, *options)
+
+
+def test_files_of_both_ranges_warn():
+    with pytest.warns(UserWarning, match='0-1 and 0-255, which do not mix.*imread="cv2"'):
+        lesson.extract_features([PATCHES[0], PATCHES[1] / 255], hist_range=None)

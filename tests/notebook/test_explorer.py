@@ -161,17 +161,6 @@ def test_each_view_shows_another_image(explorer, scenes):
     np.testing.assert_array_equal(scenes[0], render_scene(shape=SHAPE, vehicles=3, random_state=1).image)
 
 
-def test_the_summary_counts_windows_and_boxes(explorer, scenes):
-    hits, found = len(explorer.windows()), len(explorer.boxes())
-    total = len(explorer._all_windows())
-    assert explorer.summary() == f"frame 0, 640x360: {hits:,} of {total:,} windows above 0, {found} boxes"
-    explorer.set_regions("heat", threshold=1e6)
-    assert explorer.summary().endswith("0 boxes")
-    network = Explorer(scenes)
-    hits, found = len(network.windows()), len(network.boxes())
-    assert network.summary() == f"frame 0, 640x360: {hits:,} windows above 0, {found} boxes"
-
-
 # Frames
 
 

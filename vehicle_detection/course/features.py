@@ -393,6 +393,11 @@ def extract_features(
         for index, item in enumerate(items[start : start + _CHUNK], start):
             image = read(os.fspath(item)) if isinstance(item, (str, os.PathLike)) else item
             images.append(check_lesson_image(image, f"imgs[{index}]", drop_alpha=True))
+        if len({image.dtype == np.uint8 for image in images}) > 1:
+            warn(
+                "imgs have values 0-1 and 0-255, which do not mix: PNG files are read as 0-1, others not; "
+                'imread="cv2" reads all as 0-255'
+            )
         vectors += options.compute(images)
     return vectors
 

@@ -38,6 +38,7 @@ from vehicle_detection.search import BandFilters
 from vehicle_detection.svm import (
     UNIT_CHANNELS,
     VehicleClassifier,
+    flatten_steps,
     fold_estimators,
     has_unit_range,
     n_features,
@@ -409,6 +410,17 @@ def _read_estimators(clf: Any, scaler: Any, options: FeatureOptions, state: list
                 raise InvalidInputError(
                     f"the {name} must be fitted; got an unfitted {type(estimator).__name__}: call fit first"
                 ) from None
+    if isinstance(clf, VehicleClassifier):
+        # The gains change the weights only, not the features.
+        params = dataclasses.replace(clf.params, hist_gain=1.0, coarse_gain=1.0)
+        if scaler is not None or params != options.params or not options.has_library_range:
+            raise InvalidInputError(
+                "a model of the library needs no scaler, and the options of its own features; "
+                "HeatmapDetector(model) and vehicle_detection.find_cars(image, model) know them"
+            )
+    if 1 not in getattr(clf, "classes_", (1,)):
+        must = "be trained with the label 1 for vehicles and 0 for others"
+        raise invalid("the classifier", must, clf.classes_.tolist())
     if options.hog_feat and options.blocks < 1:
         block = f"a block of {options.cell_per_block} cells of {options.pix_per_cell} pixels"
         raise InvalidInputError(f"{block} must fit into a window of {PATCH_SIZE} pixels")
@@ -427,7 +439,8 @@ def _read_estimators(clf: Any, scaler: Any, options: FeatureOptions, state: list
             filters = classifier.filters
     if options.hist_feat and not options.hist_range:
         filters = None
-    unit_range = _was_fitted_on_unit_range(scaler, options)
+    own = isinstance(clf, VehicleClassifier)  # trained on uint8 patches
+    unit_range = False if own else _was_fitted_on_unit_range(flatten_steps([scaler, clf])[0], options)
     return _Estimators(clf, scaler, options, state, classifier, filters, unit_range)
 
 
