@@ -152,20 +152,26 @@ def _list_zip(path: Path) -> dict[str, str]:
     return found if single else {f"{path.stem}/{name}": member for name, member in found.items()}
 
 
-def infer_labels(listing: Listing) -> NDArray[np.bool_]:
-    """Label patches by the innermost folder name, or else the zip's name, that stands for a class."""
-    known: dict[str, bool] = {}
+def folder_labels(listing: Listing) -> dict[str, bool | None]:
+    """Label of each folder by the innermost folder name, or else the zip's name, that stands for a class."""
+    found: dict[str, bool | None] = {}
     for folder in dict.fromkeys(map(parent_folder, listing.names)):
         parts = folder.split("/") if listing.path.is_dir() else [listing.path.stem, *folder.split("/")]
         classes = [CLASS_FOLDERS.get(re.sub("[-_ ]", "", part.lower())) for part in parts]
-        labels = [label for label in classes if label is not None]
-        if not labels:
+        found[folder] = next((label for label in reversed(classes) if label is not None), None)
+    return found
+
+
+def infer_labels(listing: Listing) -> NDArray[np.bool_]:
+    """Label patches by `folder_labels`, which must know each folder."""
+    known = folder_labels(listing)
+    for folder, label in known.items():
+        if label is None:
             raise InvalidInputError(
                 f"label must be 1 or 0 for {listing.path}, because no folder in {folder!r} is named vehicles "
                 "or non-vehicles; pass label=1 for vehicles, 0 for non-vehicles"
             )
-        known[folder] = labels[-1]
-    return np.array([known[parent_folder(name)] for name in listing.names])
+    return np.array([known[parent_folder(name)] for name in listing.names], np.bool_)
 
 
 def decode_listings(

@@ -15,8 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check, describe, natural_key
-from vehicle_detection.datasets.archives import decode_listings, infer_labels, list_patches, parent_folder
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.datasets.archives import (
+    decode_listings,
+    folder_labels,
+    infer_labels,
+    list_patches,
+    parent_folder,
+)
+from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.features import PATCH_SIZE
 
 
@@ -198,8 +204,8 @@ def load_training_patches(
 ) -> PatchSet:
     """Read both classes into one set of 64x64 patches, vehicles first, each in natural order.
 
-    `vehicles` and `non_vehicles` are a folder or zip file each, such as `fetch_patches` returns. Options: see
-    `load_patches`.
+    `vehicles` and `non_vehicles` are a folder or zip file each, such as `fetch_patches` returns; a folder in
+    them whose name stands for the other class raises a `DatasetError`. Options: see `load_patches`.
 
     >>> load_training_patches("v.zip", "n.zip")  # doctest: +ELLIPSIS
     Traceback (most recent call last):
@@ -207,6 +213,11 @@ def load_training_patches(
     vehicle_detection.errors.DatasetError: vehicles v.zip does not exist; check the path, ...
     """
     listings = [list_patches(vehicles, "vehicles"), list_patches(non_vehicles, "non_vehicles")]
+    for listing, name, label in zip(listings, ("vehicles", "non_vehicles"), (True, False)):
+        swapped = [folder for folder, known in folder_labels(listing).items() if known is (not label)]
+        if swapped:
+            must = f"hold one class only, but {swapped[0]!r} is a folder of the other"
+            raise DatasetError(f"{name} {listing.path} must {must}; pass the two classes apart and in order")
     patches = decode_listings(listings, size=PATCH_SIZE, jobs=jobs, progress=progress)
     names, others = (listing.names for listing in listings)
     return PatchSet(patches, np.arange(len(patches)) < len(names), names + others)
