@@ -17,12 +17,13 @@ from sklearn.svm import LinearSVC
 
 from tests.helpers import failing, random_classifier
 from vehicle_detection import FeatureParams, PatchSet, extract_features, write_image
-from vehicle_detection._common import FORMAT_VERSION, blur_patches, degrade_patches, mirror_patches
+from vehicle_detection._common import FORMAT_VERSION
 from vehicle_detection._common.model_file import FORMAT, checksum
 from vehicle_detection._kernels import fit_svm
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.svm import KIND, Template, VehicleClassifier, load_classifier
 from vehicle_detection.training import TrainingOptions, patch_features, to_pipeline, train_classifier
+from vehicle_detection.training.classifier import blur_patches, degrade_patches, mirror_patches
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
 

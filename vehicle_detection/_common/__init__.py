@@ -1,7 +1,6 @@
-"""Helpers for all packages: argument checks, files, threads, progress bars, model files, augmentation."""
+"""Helpers for all packages: argument checks, files, threads, progress bars, model files."""
 
 from vehicle_detection._common import check, fields
-from vehicle_detection._common.augment import blur_patches, degrade_patches, mirror_patches
 from vehicle_detection._common.check import Floats, describe, invalid, is_listing, shorten, warn
 from vehicle_detection._common.files import (
     atomic_write,

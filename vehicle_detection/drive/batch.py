@@ -27,15 +27,7 @@ from vehicle_detection._common import (
     pluralize,
     progress_bar,
 )
-from vehicle_detection.drive.batch_store import (
-    COUNTS,
-    DONE,
-    ERROR,
-    FAILED,
-    Store,
-    is_complete,
-    open_store,
-)
+from vehicle_detection.drive.batch_store import COUNTS, DONE, ERROR, FAILED, Store, is_complete, open_store
 from vehicle_detection.drive.batch_trip import (
     BUSY,
     RECORDED,

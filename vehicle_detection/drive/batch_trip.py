@@ -38,14 +38,7 @@ from vehicle_detection.annotator import Annotator
 from vehicle_detection.camera import open_camera
 from vehicle_detection.datasets import DIGITS, track_records
 from vehicle_detection.detector import VehicleDetector, load_model
-from vehicle_detection.drive.batch_store import (
-    DONE,
-    ERROR,
-    FAILED,
-    Store,
-    is_complete,
-    open_store,
-)
+from vehicle_detection.drive.batch_store import DONE, ERROR, FAILED, Store, is_complete, open_store
 from vehicle_detection.drive.trips import Trip, find_trips
 from vehicle_detection.errors import (
     InvalidInputError,

@@ -12,12 +12,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check, describe
 from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import (
-    LabelledFrames,
-    best_f1,
-    match_detections,
-    prepare_evaluation,
-)
+from vehicle_detection.evaluation import LabelledFrames, best_f1, match_detections, prepare_evaluation
 from vehicle_detection.notebook import style
 from vehicle_detection.notebook.style import SKY, TRUTH, VERMILION, Image
 from vehicle_detection.tables import FrameKey, TrackTable

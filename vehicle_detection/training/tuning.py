@@ -40,12 +40,7 @@ from vehicle_detection.regions import RegionParams
 from vehicle_detection.search import SearchParams
 from vehicle_detection.svm import VehicleClassifier
 from vehicle_detection.tables import TrackTable
-from vehicle_detection.training.classifier import (
-    DEFAULT_C,
-    TrainingOptions,
-    fit_features,
-    train_classifier,
-)
+from vehicle_detection.training.classifier import DEFAULT_C, TrainingOptions, fit_features, train_classifier
 from vehicle_detection.training.feature_cache import FeatureCache, digest_of
 from vehicle_detection.training.results import RowStore, make_table
 

@@ -17,12 +17,7 @@ from vehicle_detection._common import NETWORK_TIMEOUT, check, describe, local_pa
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import IMAGE_SUFFIXES
 from vehicle_detection.tracking import USUAL_FPS
-from vehicle_detection.video.ffmpeg import (
-    input_options,
-    network_options,
-    restrict_input,
-    source_name,
-)
+from vehicle_detection.video.ffmpeg import input_options, network_options, restrict_input, source_name
 from vehicle_detection.video.files import check_file, download, is_video_file, list_files
 from vehicle_detection.video.live import LiveStream
 from vehicle_detection.video.probe import VideoInfo, joined_length, probe, with_repeats

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from tests.helpers import rendered_patches
-from vehicle_detection._common import blur_patches, degrade_patches
+from vehicle_detection.training.classifier import blur_patches, degrade_patches
 
 
 @pytest.fixture(scope="module")
