@@ -167,7 +167,7 @@ def test_estimators_that_cannot_be_used(patches, labels):
         train(LinearSVC)
     with pytest.raises(InvalidInputError, match="estimator must be a scikit-learn classifier without its"):
         train(make_pipeline(StandardScaler(), LinearSVC()))
-    with pytest.raises(InvalidInputError, match=r"must be a scikit-learn classifier .*; got 'svm'"):
+    with pytest.raises(InvalidInputError, match=r"must be a scikit-learn classifier .*, got 'svm'"):
         train("svm")
     with pytest.raises(InvalidInputError, match=r"must accept sample_weight .*; LinearDis.* does not"):
         train(LinearDiscriminantAnalysis(), degraded=0.1)

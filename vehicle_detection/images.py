@@ -126,11 +126,7 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
     Gray becomes three equal channels, alpha is dropped, 16 bits become 8, and the EXIF rotation is applied.
     """
     size, image = image_size(data), None
-    if size is not None and size[0] * size[1] > Limit.PIXELS.current():
-        raise InvalidInputError(
-            f"{name} must have at most {Limit.PIXELS.current():,} pixels, got {size[0]}x{size[1]}; if the "
-            f"image is meant to be so large, set {Limit.PIXELS.variable}"
-        )
+    _check_pixels(size, name)
     if size is not None and _TIFF.match(data) and _is_raw(_tiff_tags(data)):
         raise InvalidInputError(
             f"{name} must be no raw photo, which holds a small preview; convert it to JPEG"
@@ -157,6 +153,15 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
     return np.asarray(image, np.uint8)
 
 
+def _check_pixels(size: tuple[int, int] | None, name: str) -> None:
+    """Raise if an image has too many pixels; its width and height may be unknown."""
+    if size is not None and size[0] * size[1] > Limit.PIXELS.current():
+        raise InvalidInputError(
+            f"{name} must have at most {Limit.PIXELS.current():,} pixels, got {size[0]}x{size[1]}; if the "
+            f"image is meant to be so large, set {Limit.PIXELS.variable}"
+        )
+
+
 def _decode_heif(data: bytes, name: str) -> NDArray[np.uint8]:
     """Decode a picture of a phone with the package pillow-heif, if it is installed."""
     try:
@@ -168,15 +173,12 @@ def _decode_heif(data: bytes, name: str) -> NDArray[np.uint8]:
         ) from None
     try:
         picture = open_heif(data, convert_hdr_to_8bit=True)
-        width, height = picture.size
-        if width * height <= Limit.PIXELS.current():
-            return image_array(picture.to_pillow())
+        _check_pixels(picture.size, name)
+        return image_array(picture.to_pillow())
+    except InvalidInputError:
+        raise
     except (OSError, ValueError, RuntimeError, MemoryError) as error:
         raise InvalidInputError(f"{name} must be a complete HEIC file; it cannot be read: {error}") from None
-    raise InvalidInputError(
-        f"{name} must have at most {Limit.PIXELS.current():,} pixels, got {width}x{height}; if the image is "
-        f"meant to be so large, set {Limit.PIXELS.variable}"
-    )
 
 
 def _is_truncated(data: bytes) -> bool:

@@ -20,7 +20,7 @@ RESULT = FrameResult(0, None, NONE, NONE, ())
 @pytest.mark.parametrize(
     ("name", "arguments", "options", "argument"),
     [
-        ("plot_hog", [gray_image(30, 30)], {"pix_per_cell": [16]}, "images.0. must have at least the size"),
+        ("plot_hog", [gray_image(30, 30)], {"pix_per_cell": [16]}, "images.0. must have 32x32 pixels"),
         ("show_images", [[IMAGE]], {"boxes": [[1, 2, 3, 4]]}, r"boxes\[0\]"),
         ("plot_errors", [FRAMES, BOXES.renamed(lambda key: key + 5)], {}, "predictions hold frame 5"),
         ("plot_precision_recall", [(np.ones(2), np.ones(3), np.ones(2))], {}, "curves"),

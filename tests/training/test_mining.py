@@ -66,7 +66,7 @@ def test_invalid_arguments(frames, labels, random_svm):
     for arguments, message in (
         ((images, labels.renamed(str), random_svm), "must name the frames, such as 0"),
         ((images, [[0, 0, 5, 5]], random_svm), "labels must be .*, got"),
-        ((7, labels, random_svm), "frames must be a list of images, a mapping .*; got 7"),
+        ((7, labels, random_svm), "frames must be a list of images, a mapping .*, got 7"),
         (([images[0].astype(float)], labels, random_svm), r"frame 0 must be an \(H, W, 3\) uint8 RGB array"),
     ):
         with pytest.raises(InvalidInputError, match=message):

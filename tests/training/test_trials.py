@@ -56,7 +56,7 @@ def test_frames_are_scored_like_the_detector(patch_set, frames, labels):
 
 
 def test_invalid_options(patch_set, frames):
-    with pytest.raises(InvalidInputError, match="frames must be LabelledFrames, one or more; got 3"):
+    with pytest.raises(InvalidInputError, match="frames must be a LabelledFrames, got 3"):
         TrialOptions(frames=[3])
     with pytest.raises(InvalidInputError, match="frames must have different names"):
         TrialOptions(frames=[frames, frames])

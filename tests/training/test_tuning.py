@@ -76,7 +76,7 @@ def test_impossible_combinations_are_reported_and_skipped(patch_set, caplog):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"configurations": []}, "configurations must be a mapping .* at least one entry; got"),
+        ({"configurations": []}, "configurations must be a mapping .* at least one entry, got"),
         ({"configurations": ["vgg"]}, "preset must be one of"),
         ({"configurations": [{"orientt": 9}]}, "configuration has the unknown option 'orientt'; use color_"),
         ({"splits": "half"}, "splits must be one of 'sequences', 'groups'"),
@@ -119,8 +119,8 @@ def test_the_text_of_a_grid(text, message):
 @pytest.mark.parametrize(
     ("grid", "message"),
     [
-        ({}, r"grid must map option names \(color_space, .*\) to lists of values; got"),
-        ({"orient": 8}, r"grid\['orient'\] must be a list of values, one or more; got 8"),
+        ({}, r"grid must map option names \(color_space, .*\) to lists of values, got"),
+        ({"orient": 8}, r"grid\['orient'\] must be a list of values, one or more, got 8"),
         ({"color_space": "LAB"}, r"grid\['color_space'\] must be a list of values"),
         ({"orient": []}, r"grid\['orient'\] must be a list of values, one or more"),
     ],

@@ -178,6 +178,12 @@ def shape(value: object) -> tuple[int, int]:
     return integer(value[0], "shape[0]", low=1), integer(value[1], "shape[1]", low=1)
 
 
+def function(value: object, name: str, of: str) -> None:
+    """Raise unless `value` is a function of what `of` names, or None."""
+    if value is not None and not callable(value):
+        raise invalid(name, f"be a function of {of}", value)
+
+
 def flags(**values: object) -> None:
     """Raise unless each value, named by its argument, is a bool, or an integer in place of one."""
     for name, value in values.items():

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check, describe, natural_key
+from vehicle_detection._common import check, invalid, natural_key
 from vehicle_detection.datasets.archives import (
     decode_listings,
     folder_labels,
@@ -97,10 +97,8 @@ class PatchSet:
         """Select patches by a slice, a mask or indices."""
         selected = np.arange(len(self))[rows]
         if selected.ndim != 1:
-            raise InvalidInputError(
-                f"rows must be a slice, a mask or a list of indices, got {describe(rows)}; "
-                "a single patch is patch_set.patches[index]"
-            )
+            remedy = "a single patch is patch_set.patches[index]"
+            raise invalid("rows", "be a slice, a mask or a list of indices", rows, remedy)
         names = tuple(self.names[row] for row in selected)
         return PatchSet(self.patches[rows], self.labels[rows], names)
 
@@ -144,10 +142,8 @@ def check_labels(
     numbers = array.ndim == 1 and array.dtype.kind in "biuf" and np.isin(array, (0, 1)).all()
     if not numbers or count not in (None, len(array)):
         all_of = of if count is None else f"{count} {of}"
-        raise InvalidInputError(
-            f"{name} must be 0 or 1, or booleans, for each of the {all_of}, got {describe(array)}; "
-            "convert labels of -1 and 1 with labels > 0"
-        )
+        must = f"be 0 or 1, or booleans, for each of the {all_of}"
+        raise invalid(name, must, array, "convert labels of -1 and 1 with labels > 0")
     if both and len(np.unique(array)) < 2:
         raise InvalidInputError(f"{name} must hold both classes: vehicles (1) and non-vehicles (0)")
     return array.astype(np.bool_)

@@ -189,7 +189,9 @@ def run_batch(
     check.flags(
         tracks_only=tracks_only, audio=audio, retry_failed=retry_failed, dry_run=dry_run, progress=progress
     )
-    _check_callables(executor, on_record)
+    if executor is not None and not hasattr(executor, "submit"):
+        raise invalid("executor", "be an executor of concurrent.futures", executor, "omit it")
+    check.function(on_record, "on_record", "a record")
     workers = available_cores() if jobs is None else check.integer(jobs, "jobs", low=1, high=1024)
     check.choice(preset, "preset", PRESETS)
     if executor is None and not dry_run:
@@ -225,13 +227,6 @@ def run_batch(
     numbers = {name: counts[status] for name, status in COUNTS.items()}
     numbers |= {"trips": len(tasks), "skipped": counts["skipped"], "frames": counts["frames"]}
     return BatchReport(**numbers, seconds=time.perf_counter() - started, messages=messages, planned=planned)
-
-
-def _check_callables(executor: object, on_record: object) -> None:
-    if executor is not None and not hasattr(executor, "submit"):
-        raise invalid("executor", "be an executor of concurrent.futures", executor, "omit it")
-    if on_record is not None and not callable(on_record):
-        raise invalid("on_record", "be a function of a record", on_record)
 
 
 def _parse_shard(shard: object) -> tuple[int, int]:

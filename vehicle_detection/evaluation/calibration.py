@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check, describe
+from vehicle_detection._common import check, invalid
 from vehicle_detection.boxes import Platt as Platt  # its result
 from vehicle_detection.datasets import check_labels
 from vehicle_detection.errors import InvalidInputError
@@ -40,7 +40,7 @@ def calibrate_scores(
     check.boolean(prior, "prior")
     values = check.array(scores, "scores")
     if values.ndim != 1 or not values.size or values.dtype.kind not in "iuf":
-        raise InvalidInputError(f"scores must be a one-dimensional array of numbers; got {describe(values)}")
+        raise invalid("scores", "be a one-dimensional array of numbers", values)
     if not np.isfinite(values).all():
         raise InvalidInputError("scores must be finite, got NaN or infinity; drop those rows")
     truth = check_labels(labels, count=len(values), of="scores", both=True).astype(np.int64)
@@ -70,9 +70,7 @@ def _check_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64]
         return np.ones(count)
     values = check.array(weights, "weights")
     if values.shape != (count,) or values.dtype.kind not in "iuf":
-        raise InvalidInputError(
-            f"weights must be one number for each of the {count} scores; got {describe(values)}"
-        )
+        raise invalid("weights", f"be one number for each of the {count} scores", values)
     if not (np.isfinite(values).all() and (values > 0).all()):
         raise InvalidInputError("weights must be positive and finite; drop the samples that are not to count")
     return np.asarray(values / values.mean(), np.float64)
@@ -91,10 +89,8 @@ def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int 
     values = check.array(probabilities, "probabilities")
     inside = values.dtype.kind in "iuf" and bool(((values >= 0) & (values <= 1)).all())
     if values.ndim != 1 or not values.size or not inside:
-        raise InvalidInputError(
-            f"probabilities must be a one-dimensional array of numbers from 0 to 1, got {describe(values)}; "
-            "convert scores with calibrate_scores(...).probability"
-        )
+        remedy = "convert scores with calibrate_scores(...).probability"
+        raise invalid("probabilities", "be a one-dimensional array of numbers from 0 to 1", values, remedy)
     truth = check_labels(labels, count=len(values), of="probabilities")
     count = check.integer(bins, "bins", low=1, high=10**6)
     values = values.astype(np.float64)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check, describe, fields, pluralize
+from vehicle_detection._common import check, fields, invalid, pluralize
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.matching import match_names
@@ -27,10 +27,8 @@ def keyed_frames(frames: Frames) -> Mapping[FrameKey, NDArray[np.uint8]] | Frame
         return given
     if isinstance(given, (list, tuple)):
         return dict(enumerate(given))
-    raise InvalidInputError(
-        "frames must be a list of images, a mapping from key to image, or the frames of load_frames; "
-        f"got {describe(given)}"
-    )
+    must = "be a list of images, a mapping from key to image, or the frames of load_frames"
+    raise invalid("frames", must, given)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,7 +51,7 @@ class LabelledFrames:
     def __post_init__(self) -> None:
         name: object = self.name
         if not isinstance(name, str) or not name:
-            raise InvalidInputError(f"name must be a non-empty string, got {describe(name)}")
+            raise invalid("name", "be a non-empty string", name)
         object.__setattr__(self, "frames", keyed_frames(self.frames))
         keys, labels = self.keys, self.labels
         if not keys:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import describe
+from vehicle_detection._common import check
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.datasets import without_suffix
 from vehicle_detection.errors import InvalidInputError
@@ -60,11 +60,7 @@ def prepare_evaluation(
 ) -> tuple[TrackTable, TrackTable, list[FrameKey]]:
     """Check both sides, drop the predictions marked ``ignore``, and list the frames in order."""
     for name, side in (("predictions", predictions), ("labels", labels)):
-        if not isinstance(side, TrackTable):
-            raise InvalidInputError(
-                f"{name} must be a TrackTable, got {describe(side)}; read a file with read_labels or convert "
-                "the Detections of each frame with TrackTable.from_detections"
-            )
+        check.instance(side, name, TrackTable, "use read_labels for a file, or TrackTable.from_detections")
     predictions = predictions[~predictions["ignore"]]
     predictions = match_names(predictions, labels.frame_keys, ("predictions", "labels"))
     given = None if frames is None else check_keys(frames, "frames")

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check, describe
+from vehicle_detection._common import check, invalid
 from vehicle_detection.drawing import draw_cell_shares
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import Explanation
 from vehicle_detection.features import (
     PATCH_SIZE,
@@ -113,10 +112,8 @@ def plot_hog(
     for index, (image, name) in enumerate(zip(listed, names)):
         source = hog_source(check.image(image, f"images[{index}]"), params)
         if min(source.shape[:2]) < side:
-            raise InvalidInputError(
-                f"images[{index}] must have at least the size of a block ({side}x{side} pixels), got "
-                f"{describe(image)}; pass a larger image or a smaller pix_per_cell"
-            )
+            must, remedy = f"have {side}x{side} pixels, a block, or more", "or pass a smaller pix_per_cell"
+            raise invalid(f"images[{index}]", must, image, remedy)
         for channel, letter in enumerate(hog_channel_names(params)):
             columns.append((source[..., channel], f"{name}: {letter}" if name else letter))
     width = min(2.2, 12.5 / len(columns)) if len(columns) > 1 else 6.0

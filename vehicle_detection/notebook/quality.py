@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check, describe
+from vehicle_detection._common import check, invalid
 from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, best_f1, match_detections, prepare_evaluation
@@ -68,10 +68,8 @@ def plot_precision_recall(
 def _check_curve(curve: object, name: str) -> Curve:
     text = f"curves[{name!r}]" if name else "curves"
     if not isinstance(curve, tuple) or len(curve) != 3 or len({np.shape(part) for part in curve}) > 1:
-        raise InvalidInputError(
-            f"{text} must be (precision, recall, thresholds), got {describe(curve)}; "
-            "pass what precision_recall_curve returns"
-        )
+        remedy = "pass what precision_recall_curve returns"
+        raise invalid(text, "be (precision, recall, thresholds)", curve, remedy)
     precision, recall, thresholds = (np.asarray(part, np.float64) for part in curve)
     if precision.ndim != 1 or not precision.size or np.isnan(recall).any():
         raise InvalidInputError(f"{text} must be computed from detections and labelled vehicles; got none")

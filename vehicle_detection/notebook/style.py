@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Union
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check, describe
+from vehicle_detection._common import check, invalid
 from vehicle_detection.boxes import Detections
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
@@ -116,10 +116,7 @@ def check_list(values: object, name: str, kind: str) -> list[Any]:
     single = isinstance(values, (str, bytes)) or (isinstance(values, np.ndarray) and values.ndim < 4)
     listed = list(values) if isinstance(values, Iterable) and not single else []
     if not listed:
-        raise InvalidInputError(
-            f"{name} must be a list of {kind}, at least one; got {describe(values)}; "
-            "wrap a single one in a list"
-        )
+        raise invalid(name, f"be a list of {kind}, at least one", values, "wrap a single one in a list")
     return listed
 
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import vehicle_detection
 from vehicle_detection import _kernels as kernels
-from vehicle_detection._common import check, describe, fields
+from vehicle_detection._common import check, describe, fields, invalid
 from vehicle_detection.datasets import PatchSet, check_labels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, extract_features, read_patches
@@ -275,9 +275,7 @@ def _fit_estimator(
 
     is_estimator = hasattr(estimator, "fit") and hasattr(estimator, "get_params")
     if not is_estimator or isinstance(estimator, type) or hasattr(estimator, "steps"):
-        raise InvalidInputError(
-            f"estimator must be a scikit-learn classifier without its scaler; got {describe(estimator)}"
-        )
+        raise invalid("estimator", "be a scikit-learn classifier without its scaler", estimator)
     weighted = bool((weights != 1).any())
     if weighted and not has_fit_parameter(estimator, "sample_weight"):
         raise InvalidInputError(

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check, describe
+from vehicle_detection._common import check, invalid
 from vehicle_detection.datasets import load_frames, read_labels
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, match_names
@@ -43,10 +43,10 @@ class FrameDataset:
     def __post_init__(self) -> None:
         name: object = self.name
         if not isinstance(name, str) or not name:
-            raise InvalidInputError(f"name must be a non-empty string, got {describe(name)}")
+            raise invalid("name", "be a non-empty string", name)
         sets: object = self.sets
         if not isinstance(sets, (tuple, list)) or not sets:
-            raise InvalidInputError(f"sets must be a tuple of at least one entry; got {describe(sets)}")
+            raise invalid("sets", "be a tuple of at least one entry", sets)
         for part in sets:
             check.instance(part, "sets", LabelledFrames, "pass frames with labels as LabelledFrames")
         object.__setattr__(self, "sets", tuple(sets))
@@ -55,9 +55,7 @@ class FrameDataset:
 def check_sources(sources: object) -> tuple[FrameDataset, ...]:
     """Return one or more data sets with different names."""
     if not isinstance(sources, (tuple, list)) or not sources:
-        raise InvalidInputError(
-            f"sources must be a list of FrameDataset, one or more; got {describe(sources)}"
-        )
+        raise invalid("sources", "be a list of FrameDataset, one or more", sources)
     for source in sources:
         check.instance(source, "sources", FrameDataset, "wrap the frames of each camera or country in one")
     names = [source.name for source in sources]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import atomic_write, check, check_suffix, describe, import_pyarrow
+from vehicle_detection._common import atomic_write, check, check_suffix, import_pyarrow
 from vehicle_detection.errors import DatasetError, InvalidInputError
 
 if TYPE_CHECKING:
@@ -31,11 +31,8 @@ def check_column(table: DataFrame, name: object) -> None:
     """Raise unless `table` is a pandas table with the column."""
     import pandas as pd
 
-    if not isinstance(table, pd.DataFrame):
-        raise InvalidInputError(
-            f"table must be a pandas DataFrame, got {describe(table)}; "
-            "pass what compare_configurations or read_results returns"
-        )
+    remedy = "pass what compare_configurations or read_results returns"
+    check.instance(table, "table", pd.DataFrame, remedy)
     if not isinstance(name, str) or name not in table.columns:
         listed = ", ".join(map(str, table.columns))
         raise InvalidInputError(f"table has no column {name!r}; its columns are {listed or 'none'}")

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check, describe, is_listing, progress_bar
+from vehicle_detection._common import check, invalid, is_listing, progress_bar
 from vehicle_detection.datasets import (
     SEEDED_SPLITS,
     SPLIT_NAMES,
@@ -92,8 +92,7 @@ class TrialOptions:
     def __post_init__(self) -> None:
         object.__setattr__(self, "frames", self.frame_sets)  # a generator can be read only once
         for each in self.frame_sets:
-            if not isinstance(each, LabelledFrames):
-                raise InvalidInputError(f"frames must be LabelledFrames, one or more; got {describe(each)}")
+            check.instance(each, "frames", LabelledFrames, "pass LabelledFrames(name, images, labels)")
         if len({each.name for each in self.frame_sets}) < len(self.frame_sets):
             raise InvalidInputError("frames must have different names; pass name=")
 
@@ -250,15 +249,12 @@ def expand_grid(grid: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
     """
     given: object = grid
     if not isinstance(given, Mapping) or not given:
-        raise InvalidInputError(
-            f"grid must map option names ({', '.join(_FIELDS)}) to lists of values; got {describe(given)}"
-        )
+        raise invalid("grid", f"map option names ({', '.join(_FIELDS)}) to lists of values", given)
     _check_names(grid, "grid")
     lists = [list(values) if is_listing(values) else [] for values in grid.values()]
     for name, values in zip(grid, lists):
         if not values:
-            given = describe(grid[name])
-            raise InvalidInputError(f"grid[{name!r}] must be a list of values, one or more; got {given}")
+            raise invalid(f"grid[{name!r}]", "be a list of values, one or more", grid[name])
     count = math.prod(map(len, lists))
     if count > _MAX_COMBINATIONS:
         raise InvalidInputError(f"grid must have at most {_MAX_COMBINATIONS} combinations; got {count}")
@@ -321,10 +317,8 @@ def read_configurations(
     else:
         pairs = [(None, each) for each in given] if is_listing(given) else []
     if not pairs:
-        raise InvalidInputError(
-            "configurations must be a mapping from names to FeatureParams or a list of them, with at least "
-            f"one entry; got {describe(given)}"
-        )
+        must = "be a mapping from names to FeatureParams or a list of them, with at least one entry"
+        raise invalid("configurations", must, given)
     read = [(name, _read_options(configuration)) for name, configuration in pairs]
     return [
         _make_candidate(name, {**_TRAINING, "C": value, **options})
@@ -340,10 +334,8 @@ def _read_options(configuration: object) -> dict[str, Any]:
     if isinstance(configuration, FeatureParams):
         configuration = dataclasses.asdict(configuration)
     if not isinstance(configuration, Mapping):
-        raise InvalidInputError(
-            "a configuration must be FeatureParams, a mapping of options or a preset's name; "
-            f"got {describe(configuration)}"
-        )
+        must = "be FeatureParams, a mapping of options or a preset's name"
+        raise invalid("a configuration", must, configuration)
     _check_names(configuration, "configuration")
     return dict(configuration)
 
@@ -404,9 +396,7 @@ def _check_seeds(seeds: object) -> tuple[int, ...]:
     listed = seeds if is_listing(seeds) else ()
     checked = tuple(check.integer(seed, "seeds", low=0, high=2**32 - 1) for seed in listed)
     if not checked or len(set(checked)) < len(checked):
-        raise InvalidInputError(
-            f"seeds must be a list of different integers, such as range(5); got {describe(seeds)}"
-        )
+        raise invalid("seeds", "be a list of different integers, such as range(5)", seeds)
     return checked
 
 

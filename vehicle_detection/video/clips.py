@@ -9,8 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check, describe
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection._common import check, invalid
 from vehicle_detection.tracking import USUAL_FPS, FrameResult
 
 Clip = TypeVar("Clip")
@@ -54,16 +53,13 @@ def annotate_clip(
     >>> annotate_clip(clip, VehicleDetector()).write_videofile("found.mp4")  # doctest: +SKIP
     """
     if not all(hasattr(detector, name) for name in ("process", "reset", "annotator")):
-        raise InvalidInputError(f"detector must be a VehicleDetector, got {describe(detector)}")
+        raise invalid("detector", "be a VehicleDetector", detector)
     given: Any = clip
     if not all(hasattr(given, name) for name in ("transform", "get_frame", "size")):
-        raise InvalidInputError(
-            f"clip must be a video clip of moviepy 2, got {describe(clip)}; pass VideoFileClip(path), or "
-            "use process_video for a file"
-        )
+        remedy = "pass VideoFileClip(path), or use process_video for a file"
+        raise invalid("clip", "be a video clip of moviepy 2", clip, remedy)
     every = check.integer(every, "every", low=1, high=1000)
-    if on_result is not None and not callable(on_result):
-        raise InvalidInputError(f"on_result must be a function of a result, got {describe(on_result)}")
+    check.function(on_result, "on_result", "a result")
     own, fps = copy.copy(detector), getattr(given, "fps", None)
     last_time: float | None = None
     count, picture = 0, np.empty(0, np.uint8)

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from vehicle_detection._common import NETWORK_TIMEOUT, check, describe, local_path, temporary_folder
+from vehicle_detection._common import NETWORK_TIMEOUT, check, invalid, local_path, temporary_folder
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import IMAGE_SUFFIXES
 from vehicle_detection.tracking import USUAL_FPS
@@ -185,11 +185,9 @@ def _open(source: object, options: _Options) -> FrameSource:
     if isinstance(source, (list, tuple)) and all(isinstance(each, is_path) for each in source):
         return _open_files([check_file(path) for path in source], options)
     if not isinstance(source, is_path):
-        raise InvalidInputError(
-            f"source must be the path of a video file, a folder, a pattern, a list of files, a URL, '-' or a "
-            f"camera's number, got {describe(source)}; pass a file name, or call detector.process(frame, "
-            "time) with frames of your own"
-        )
+        must = "be a video file, a folder, a pattern, a list of files, a URL, '-' or a camera's number"
+        remedy = "pass a file name, or call detector.process(frame, time) with frames of your own"
+        raise invalid("source", must, source, remedy)
     text = os.fsdecode(source)
     if text == "-":
         return _open_stdin(options)

@@ -29,7 +29,6 @@ from vehicle_detection._common import (
     call_in_thread,
     check,
     check_suffix,
-    describe,
     fields,
     invalid,
     temporary_folder,
@@ -306,8 +305,7 @@ def write_video(
         stack.enter_context(_name_changed_source(results.source))
         check.flags(audio=audio, show=show)
         check.instance(encoding, "encoding", Encoding | None, "omit it for the default")
-        if on_result is not None and not callable(on_result):
-            raise InvalidInputError(f"on_result must be a function of a result, got {describe(on_result)}")
+        check.function(on_result, "on_result", "a result")
         started, sink, viewer = time.perf_counter(), None, None
         drawing = None if target is None and not show else _Drawing(annotator, results)
         if drawing is not None and target is not None:
