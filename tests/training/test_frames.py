@@ -146,3 +146,13 @@ def test_images_whose_labels_have_other_names_are_not_empty_frames(tmp_path, cap
     assert set(source.sets[0].keys) == set(source.sets[0].labels["frame"].tolist()) == {"1.png"}
     assert "1 of 2 labelled frames have no image in" in caplog.text
     assert "such as '2_png.rf.7a.png'; they are left out" in caplog.text
+
+
+def test_images_are_unlabelled_if_few_have_labels(tmp_path, caplog):
+    write_source(tmp_path, "few", 3, ["1.png,1,10,10,60,50\n"])
+    write_source(tmp_path, "empty", 3, [])
+    assert [source.sets[0].keys for source in find_sources(tmp_path)] == [
+        ("0.png", "1.png", "2.png"),
+        ("1.png",),
+    ]
+    assert "names 1 of 3 images" in caplog.text

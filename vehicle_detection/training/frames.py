@@ -82,8 +82,8 @@ def find_sources(folder: str | os.PathLike[str], *, clip_rate: float = 3.0) -> l
 
     The labels may also be .json (a COCO data set), .jsonl or .parquet.
     Its frames are in ``frames/NAME/``, ``NAME/`` or a video ``videos/NAME.mp4`` (or another suffix), of which
-    `clip_rate` frames per second are taken. If the labels name most frames of a video, the others show no
-    vehicle; if they name fewer, only these are taken.
+    `clip_rate` frames per second are taken. If the labels name most frames of a folder or video, the others
+    show no vehicle; if they name fewer, only these are taken.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -118,13 +118,20 @@ def _read_frames(root: Path, file: Path, clip_rate: float) -> LabelledFrames:
         if folder.is_dir():
             found = LabelledFrames(name, load_frames(folder), labels)
             named = set(match_names(labels, found.keys, ("labels", "frames")).frame_keys)
-            absent, unlabelled = sorted(named - set(found.keys), key=str), set(found.keys) - named
+            absent, n_unlabelled = sorted(named - set(found.keys), key=str), len(set(found.keys) - named)
             if absent:
                 # A label may be that of an image with another name, which would count as an empty frame.
                 log.warning(
                     "%s: %d of %d labelled frames have no image in %s, such as %r; they are left out, and so "
                     "are %d images without labels",
-                    *(file, len(absent), len(named), folder, absent[0], len(unlabelled)),
+                    *(file, len(absent), len(named), folder, absent[0], n_unlabelled),
+                )
+                return select_frames(found, named)
+            if named and n_unlabelled > len(named):
+                log.warning(
+                    "%s names %d of %d images in %s; the others are left out, as they seem to be unlabelled. "
+                    "If they show no vehicle, move them to a folder with a table without rows",
+                    *(file, len(named), len(found), folder),
                 )
                 return select_frames(found, named)
             return found
