@@ -701,6 +701,7 @@ def test_every_call_form_binds(call_data, form, shape):
         ),
         ("draw_boxes(d.image, d.image)", "bboxes must be .*find_car_windows returns the boxes"),
         ("draw_boxes(d.image[..., [0, 1, 2, 0]], [])", r"drop the alpha channel with img\[\.\.\., :3\]"),
+        ("show_images(d.image)", "each of the images must be an .H, W, 3. RGB array"),
         ("draw_labeled_bboxes(d.image[:, ::-1], d.labels)", "writable and contiguous"),
     ],
 )

@@ -241,7 +241,8 @@ def show_images(images: Sequence[Image], titles: Sequence[str] = (), columns: in
     import matplotlib.pyplot as plt
 
     for image in (images := check.sequence(images, "images", "images")):
-        if not isinstance(image, np.ndarray) or image.ndim != 2:
+        # A row of a single image is no (H, W) image.
+        if not isinstance(image, np.ndarray) or image.ndim != 2 or image.shape[1] <= 4:
             check_lesson_image(image, "each of the images")
     columns = min(check.integer(columns, "columns", low=1), len(images) or 1)
     rows, titles = -(-len(images) // columns) or 1, check.sequence(titles, "titles", "texts")

@@ -279,7 +279,8 @@ def _fit_estimator(
     weighted = bool((weights != 1).any())
     if weighted and not has_fit_parameter(estimator, "sample_weight"):
         raise InvalidInputError(
-            f"estimator must accept sample_weight for degraded copies; {type(estimator).__name__} does not"
+            "estimator must accept sample_weight for degraded copies and positive_weight; "
+            f"{type(estimator).__name__} does not"
         )
     scaler = StandardScaler(copy=False).fit(features)
     scaled = scaler.transform(features)
