@@ -121,6 +121,7 @@ def test_tune_refuses_bad_input(patches, material, tmp_path, monkeypatch):
         "{patches} -o t.csv --grid orient": "--grid must look like 'orient=8,9",
         "{patches} {grid} -o t.csv --model highway": "--model needs a --grid of a search",
         "{grid} -o t.csv": "--grid of features needs patches to train on; give --vehicles and",
+        "--grid 'scale=1 overlap=0.5' -o t.csv {frames}": "--grid of a search must be one of 'scales', 'ov",
         "--grid scales=1 -o t.csv": "--grid of a search needs labelled frames",
         "--grid scales=a+b -o t.csv {frames}": "--grid must join scales by +",
         "{patches} {grid} -o t.xls": "--output must end in .csv or .jsonl or .parquet",

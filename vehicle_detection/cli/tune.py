@@ -72,7 +72,9 @@ def tune(
     given = {name: path for name, path in sources.items() if path is not None}
     targets = check_targets({"--output": output, "--plot": plot}, given)
     common.check_suffix(output, "--output", (".csv", ".jsonl", ".parquet"))
-    searches = set(values) <= set(_SEARCH)
+    searches = not set(values).isdisjoint(_SEARCH)
+    for name in values if searches else ():
+        common.check.choice(name, "--grid of a search", tuple(_SEARCH))
     writes_table = searches or output.suffix.lower() != ".jsonl"  # rows of trials are stored one by one
     if writes_table:
         vd.training.check_replaceable(output, "--output")
@@ -160,8 +162,7 @@ def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None
         return None
     if frames is None or labels is None:
         raise InvalidInputError("--frames and --labels belong together; give both")
-    name, true = frames.name or "frames", vd.read_labels(labels, images=frames)
-    return vd.LabelledFrames(name, vd.load_frames(frames), true, horizon)
+    return vd.training.read_labelled_folder(frames, labels, name=frames.name or "frames", horizon=horizon)
 
 
 def _show(table: DataFrame, grid: Mapping[str, Sequence[Any]]) -> None:

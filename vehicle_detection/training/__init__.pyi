@@ -19,6 +19,7 @@ from .frames import TrainingFrame as TrainingFrame
 from .frames import check_sources as check_sources
 from .frames import find_sources as find_sources
 from .frames import load_training_frames as load_training_frames
+from .frames import read_labelled_folder as read_labelled_folder
 from .frames import select_frames as select_frames
 from .mining import mine_negatives as mine_negatives
 from .network import NetworkTraining as NetworkTraining

@@ -113,33 +113,40 @@ def find_sources(folder: str | os.PathLike[str], *, clip_rate: float = 3.0) -> l
 def _read_frames(root: Path, file: Path, clip_rate: float) -> LabelledFrames:
     """Frames of one file of labels, from a folder of images or a video."""
     name, folders = file.stem, (root / "frames" / file.stem, root / file.stem)
-    labels = read_labels(file, images=next(filter(Path.is_dir, folders), None))
     for folder in folders:
         if folder.is_dir():
-            found = LabelledFrames(name, load_frames(folder), labels)
-            named = set(match_names(labels, found.keys, ("labels", "frames")).frame_keys)
-            absent, n_unlabelled = sorted(named - set(found.keys), key=str), len(set(found.keys) - named)
-            if absent:
-                # A label may be that of an image with another name, which would count as an empty frame.
-                log.warning(
-                    "%s: %d of %d labelled frames have no image in %s, such as %r; they are left out, and so "
-                    "are %d images without labels",
-                    *(file, len(absent), len(named), folder, absent[0], n_unlabelled),
-                )
-                return select_frames(found, named)
-            if named and n_unlabelled > len(named):
-                log.warning(
-                    "%s names %d of %d images in %s; the others are left out, as they seem to be unlabelled. "
-                    "If they show no vehicle, move them to a folder with a table without rows",
-                    *(file, len(named), len(found), folder),
-                )
-                return select_frames(found, named)
-            return found
+            return read_labelled_folder(folder, file, name=name)
     videos = [path for path in (root / "videos").glob(f"{glob.escape(name)}.*") if is_video_file(path)]
     if videos:
-        return _frames_of_video(min(videos), labels, clip_rate)
+        return _frames_of_video(min(videos), read_labels(file), clip_rate)
     video = root / "videos" / f"{name}.mp4"
     raise DatasetError(f"{file} has no frames: add {folders[0]}, {folders[1]} or {video}")
+
+
+def read_labelled_folder(
+    folder: Path, file: Path, *, name: str, horizon: float | None = None
+) -> LabelledFrames:
+    """Images of a folder with the labels of a file; a warning says if some of either are left out."""
+    labels = read_labels(file, images=folder)
+    found = LabelledFrames(name, load_frames(folder), labels, horizon)
+    named, keys = set(match_names(labels, found.keys, ("labels", "frames")).frame_keys), set(found.keys)
+    absent, n_unlabelled = sorted(named - keys, key=str), len(keys - named)
+    if absent:
+        # A label may be that of an image with another name, which would count as an empty frame.
+        log.warning(
+            "%s: %d of %d labelled frames have no image in %s, such as %r; they are left out, and so are %d "
+            "images without labels",
+            *(file, len(absent), len(named), folder, absent[0], n_unlabelled),
+        )
+    elif named and n_unlabelled > len(named):
+        log.warning(
+            "%s names %d of %d images in %s; the others are left out, as they seem to be unlabelled. If they "
+            "show no vehicle, move them to a folder with a table without rows",
+            *(file, len(named), len(keys), folder),
+        )
+    else:
+        return found
+    return select_frames(found, named)
 
 
 def _frames_of_video(video: Path, labels: TrackTable, clip_rate: float) -> LabelledFrames:
