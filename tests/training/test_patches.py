@@ -173,12 +173,14 @@ def test_the_card_holds_data_license_accuracy_and_limitations(trained):
 
 def test_the_card_of_own_patches_does_not_mention_the_course():
     own = named(*rendered_patches(24), {True: ("mine", "mine"), False: ("other", "other")})
-    classifier, report = train_and_evaluate(own, params=SMALL, seeds=1, options=TrainingOptions(mirror=False))
+    options = TrainingOptions(mirror=False, positive_weight=3)
+    classifier, report = train_and_evaluate(own, params=SMALL, seeds=1, options=options)
+    assert classifier.metadata["training"]["positive_weight"] == 3
     text = model_card(classifier, report)
     for word in ("GTI", "KITTI", "Extras", "CC BY", "```", "Other features"):
         assert word not in text
     assert "inherits the terms of the patches" in text
-    assert "without mirrored patches" in text
+    assert "without mirrored patches, vehicles weighted by 3, seed 0" in " ".join(text.split())
     assert "mean of 1 seed." in text
 
 

@@ -62,7 +62,8 @@ class TrainingOptions(fields.Checked):
     def to_dict(self) -> dict[str, Any]:
         """Return the options as JSON values, as a model file keeps them."""
         values = asdict(self)
-        del values["positive_weight"]
+        if self.positive_weight == 1:
+            del values["positive_weight"]
         return {"C": values.pop("C"), "solver": "dual", **values}
 
 
