@@ -386,13 +386,17 @@ def _check_estimators(clf: Any, scaler: Any, options: FeatureOptions, image: Ima
     if known and clf is not None and "predict" not in vars(clf):
         state = [type(clf), type(scaler)]
         state += [getattr(each, name, None) for each in (clf, scaler) for name in _MODEL_STATE]
-    found, before = _last, None if _last is None or _last.options != options else _last.state
-    if found is None or before is None or state is None or not all(map(np.array_equal, before, state)):
+    found = _last
+    if found is None or found.options != options or not _are_equal(found.state, state):
         found = _last = _read_estimators(clf, scaler, options, copy.deepcopy(state))
     elif found.clf is not clf or found.scaler is not scaler:
         found = dataclasses.replace(found, clf=clf, scaler=scaler)
     _warn_of_range(found, image)
     return found
+
+
+def _are_equal(before: list[Any] | None, state: list[Any] | None) -> bool:
+    return before is not None and state is not None and all(map(np.array_equal, before, state))
 
 
 def _read_estimators(clf: Any, scaler: Any, options: FeatureOptions, state: list[Any] | None) -> _Estimators:

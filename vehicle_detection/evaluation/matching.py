@@ -27,24 +27,28 @@ def match_names(table: TrackTable, keys: Sequence[FrameKey], sides: tuple[str, s
     is one of another folder unless other names are equal.
     """
     equal = set(table.frame_keys) & set(keys)
-    by_name: dict[str, list[tuple[str, str]]] = {}
+    by_name: dict[str, list[tuple[str, str]]] = {}  # keys and their paths by file name
     for key in keys:
         if isinstance(key, str) and key not in equal:
-            by_name.setdefault(_path_of(key).rpartition("/")[2], []).append((key, _path_of(key)))
-    names: dict[FrameKey, str] = {}
-    taken = set[str]()
-    for ours in table.frame_keys:
-        path = _path_of(ours) if isinstance(ours, str) and ours not in equal else ""
+            path = _path_of(key)
+            by_name.setdefault(path.rpartition("/")[2], []).append((key, path))
+    matched: dict[str, FrameKey] = {}  # name in the table of each key
+    for name in table.frame_keys:
+        if not isinstance(name, str) or name in equal:
+            continue
+        path = _path_of(name)
         others = by_name.get(path.rpartition("/")[2], [])
         alike = [key for key, other in others if path.endswith(other) or other.endswith(path)]
-        if len(alike) > 1 or not taken.isdisjoint(alike) or (others and not alike and not equal):
+        if not others or (equal and not alike):
+            continue  # a frame of the table only
+        if len(alike) != 1 or alike[0] in matched:
             raise InvalidInputError(
-                f"frame names of {sides[0]} and {sides[1]} differ: {ours!r} and {others[0][0]!r}; use the "
+                f"frame names of {sides[0]} and {sides[1]} differ: {name!r} and {others[0][0]!r}; use the "
                 "same names on both sides, for example with TrackTable.renamed"
             )
-        taken.update(alike)
-        names |= dict.fromkeys([ours], *alike) if alike else {}
-    return table.renamed(lambda key: names.get(key, key)) if names else table
+        matched[alike[0]] = name
+    keys_of = {name: key for key, name in matched.items()}
+    return table.renamed(lambda name: keys_of.get(name, name)) if matched else table
 
 
 def _path_of(name: str) -> str:

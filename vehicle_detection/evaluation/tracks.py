@@ -117,31 +117,27 @@ def evaluate_tracks(
     _check_tracks(predictions, "predictions", keys)
     _check_tracks(labels, "labels", keys)
     clip = _match_tracks(predictions, labels, keys, min_iou, ignored_as_regions)
-    places = dict(zip(keys, _positions(keys)))
-
-    def place(side: TrackTable, rows: Ids) -> tuple[Ids, Ids]:
-        """Track and position of each row."""
-        positions = [places[key] for key in side["frame"][rows].tolist()]
-        return side["track_id"][rows], np.array(positions, np.int64)
-
-    # The labels that count, and the prediction that matches each of them, vehicle by vehicle.
+    positions = dict(zip(keys, _positions(keys)))
+    # The labels that count, vehicle by vehicle, and the prediction that matches each of them.
     targets, matched = (_join([getattr(each, name) for each in clip]) for name in ("targets", "matched"))
-    order = np.lexsort(place(labels, targets)[::-1])
-    targets, matched, found = targets[order], matched[order], matched[order] >= 0
-    vehicle, position = place(labels, targets)
-    same, both = vehicle[1:] == vehicle[:-1], found[1:] & found[:-1]
+    vehicles, times = _places(labels, targets, positions)
+    order = np.lexsort((times, vehicles))
+    targets, matched, vehicles, times = targets[order], matched[order], vehicles[order], times[order]
+    found = matched >= 0
+    # Whether a label and the next one are of the same vehicle and both matched.
+    goes_on = (vehicles[1:] == vehicles[:-1]) & found[1:] & found[:-1]
+    n_runs = int(found.sum()) - int(goes_on.sum())  # in which a vehicle is matched label by label
+    tracks = predictions["track_id"][matched[found]]
+    switches = int(((np.diff(vehicles[found]) == 0) & (np.diff(tracks) != 0)).sum())
     errors = predictions.boxes[matched] - labels.boxes[targets] if len(predictions) else np.empty((0, 4))
-    steady = np.flatnonzero(same & both & (np.diff(position) == 1))
-    tracks = np.stack([vehicle[found], predictions["track_id"][matched[found]]])
-    switches = int(((np.diff(tracks[0]) == 0) & (np.diff(tracks[1]) != 0)).sum())
-    runs = int(found.sum()) - int((same & both).sum())  # in which a vehicle is matched frame by frame
+    steady = np.flatnonzero(goes_on & (np.diff(times) == 1))
     false = _join([each.false for each in clip])
     tp, fp, fn = int(found.sum()), len(false), int((~found).sum())
     pairs = _join_pairs(predictions, labels, clip)
     return TrackScores(
         frames=len(keys),
         iou=min_iou,
-        vehicles=len(np.unique(vehicle)),
+        vehicles=len(np.unique(vehicles)),
         tracks=len(np.unique(predictions["track_id"][_join([matched[found], false])])),
         ignored=sum(each.ignored for each in clip),
         mean_iou=mean([overlap for each in clip for overlap in each.overlaps.tolist()]),
@@ -150,8 +146,8 @@ def evaluate_tracks(
         **_hota_scores(pairs, clip),
         idf1=ratio(2 * _identity_true_positives(pairs, min_iou), 2 * tp + fp + fn),
         id_switches=switches,
-        fragmentations=runs - len(np.unique(vehicle[found])),
-        longest_false_positive_run=_longest_run(*place(predictions, false)),
+        fragmentations=n_runs - len(np.unique(vehicles[found])),
+        longest_false_positive_run=_longest_run(*_places(predictions, false, positions)),
         **rates(tp, fp, fn),
     )
 
@@ -214,6 +210,11 @@ def _positions(keys: list[FrameKey]) -> list[int]:
     steps = [after - before for before, after in pairwise(numbers)]
     min_step = min(steps, default=1)
     return list(accumulate((1 if step == min_step else 2 for step in steps), initial=0))
+
+
+def _places(side: TrackTable, rows: Ids, positions: dict[FrameKey, int]) -> tuple[Ids, Ids]:
+    """Track and position of each row."""
+    return side["track_id"][rows], np.array([positions[key] for key in side["frame"][rows]], np.int64)
 
 
 def _assign_rest(overlap: Floats, kept: dict[int, int], min_iou: float) -> dict[int, int]:
