@@ -14,7 +14,6 @@ from vehicle_detection.training import FrameDataset, check_sources, find_sources
     ("changes", "message"),
     [
         ({"name": ""}, "name must be a non-empty string, got ''"),
-        ({"sets": ()}, "sets must be a tuple of at least one entry"),
         ({"sets": ("road",)}, "sets must be a LabelledFrames, got 'road'"),
     ],
 )
