@@ -150,7 +150,7 @@ def box_array(boxes: Boxes, name: str = "boxes") -> NDArray[Any]:
     return check.boxes(boxes, name)
 
 
-def add_image(ax: Axes, image: NDArray[Any], title: str = "", *, ticks: bool = False, **options: Any) -> None:
+def add_image(ax: Axes, image: NDArray[Any], title: str = "", **options: Any) -> None:
     """Show an image, by default with half-open pixels as coordinates; `options` are those of ``imshow``."""
     height, width = image.shape[:2]
     options.setdefault("extent", (0, width, height, 0))
@@ -161,8 +161,7 @@ def add_image(ax: Axes, image: NDArray[Any], title: str = "", *, ticks: bool = F
     ax.imshow(image, **options)
     if title:
         ax.set_title(title, fontsize=9)
-    if not ticks:
-        ax.set(xticks=[], yticks=[])
+    ax.set(xticks=[], yticks=[])
 
 
 def add_boxes(

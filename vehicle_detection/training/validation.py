@@ -9,13 +9,14 @@ from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import Floats, atomic_write, check, resolve_jobs, spreadsheet_text
 from vehicle_detection.boxes import Platt
+from vehicle_detection.detector import Model
 from vehicle_detection.evaluation import (
     DetectionMatches,
     LabelledFrames,
@@ -29,9 +30,6 @@ from vehicle_detection.evaluation import (
 )
 from vehicle_detection.tables import FrameKey, TrackTable
 from vehicle_detection.training.frames import FrameDataset, select_frames
-
-if TYPE_CHECKING:
-    from vehicle_detection.search import FrameSearch
 
 # Log-odds that `best_threshold` chooses from.
 _THRESHOLDS = np.arange(-4.0, 4.0, 0.02)
@@ -52,13 +50,6 @@ FOLD_COLUMNS = {
     "recall_narrow": ("under 32 px", 3), "calibration_error": ("ECE", 3),
 }  # fmt: skip
 """Columns of a table of `FoldScore`: titles and decimals."""
-
-
-class SearchableModel(Protocol):
-    """A model of any kind: ``"default"``, ``"highway"``, a network or a function."""
-
-    def open_search(self, jobs: int | None = None) -> FrameSearch:
-        """Open a search of frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,7 +153,7 @@ class FoldDetections:
 
 
 def detect_in_source(
-    model: SearchableModel, source: FrameDataset, *, min_score: float = -6.0, jobs: int | None = None
+    model: Model, source: FrameDataset, *, min_score: float = -6.0, jobs: int | None = None
 ) -> list[FoldDetections]:
     """Detect vehicles in all frames of a source, one `FoldDetections` for each of its sets.
 
@@ -170,7 +161,7 @@ def detect_in_source(
     result does not depend on `jobs`, the number of frames searched at the same time.
     """
     lowest = check.number(min_score, "min_score")
-    with model.open_search(jobs=1) as search, ThreadPoolExecutor(resolve_jobs(jobs)) as pool:
+    with model.open_search(1) as search, ThreadPoolExecutor(resolve_jobs(jobs)) as pool:
 
         def detect(part: LabelledFrames, key: FrameKey) -> Any:
             # Each image is read when it is searched: `map` would read all of an iterator in advance.

@@ -512,7 +512,6 @@ def cut_video(
     *,
     start: float | None = None,
     end: float | None = None,
-    encoding: Encoding | None = None,
 ) -> int:
     """Copy a part of a video, with its sound, to another file; returns the number of frames."""
     start, end = check_span(start, end)
@@ -522,7 +521,7 @@ def cut_video(
         with (
             _name_changed_source(opened),
             opened.read(first, count) as frames,
-            _open_writer(output, opened.info, encoding, opened.audio(first, end)) as writer,
+            _open_writer(output, opened.info, None, opened.audio(first, end)) as writer,
         ):
             for _, _, frame in frames:
                 writer.write(frame)
