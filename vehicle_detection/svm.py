@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import Floats, check, fields, invalid, pluralize, read_model, write_model
+from vehicle_detection._common import Floats, check, invalid, pluralize, read_model, write_model
 from vehicle_detection.boxes import Platt
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.features import PATCH_SIZE, FeatureParams, extract_features
@@ -60,7 +60,7 @@ class Template:
             object.__setattr__(self, name, column)
         if not (self.scale > 0).all():
             raise InvalidInputError("scale must be positive; a constant feature has scale 1")
-        fields.store_number(self, "intercept")
+        object.__setattr__(self, "intercept", check.number(self.intercept, "intercept"))
         with np.errstate(over="ignore", invalid="ignore"):
             weights, bias = self.fold()
         if not (np.isfinite(weights).all() and math.isfinite(bias)):

@@ -19,14 +19,6 @@ from typing import Any
 from vehicle_detection._common import check
 
 
-def store_number(instance: object, name: str, **bounds: float) -> None:
-    """Check an attribute of a dataclass; a number of NumPy or a fraction becomes a float."""
-    value = getattr(instance, name)
-    number = check.number(value, name, **bounds)
-    if type(value) not in (int, float):
-        object.__setattr__(instance, name, number)
-
-
 def number(default: Any = MISSING, **bounds: float) -> Any:
     """Declare a number in ``[low, high]`` that is greater than `above`."""
 

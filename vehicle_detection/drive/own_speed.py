@@ -24,7 +24,6 @@ from vehicle_detection._common import (
     Floats,
     Limit,
     check,
-    fields,
     invalid,
     pluralize,
     read_regular_file,
@@ -89,7 +88,7 @@ class OwnSpeed:
         if (self.speeds_mps < 0).any():
             lowest = float(self.speeds_mps.min())
             raise invalid("speeds_mps", "be at least 0", lowest, "pass speeds, not velocities")
-        fields.store_number(self, "max_gap", above=0)
+        object.__setattr__(self, "max_gap", check.number(self.max_gap, "max_gap", above=0))
         clock = check.array(self.clock, "clock")
         pairs = clock.ndim == 2 and clock.shape[1] == 2 and clock.dtype.kind in "iuf"
         if clock.size and not (pairs and np.isfinite(clock).all()):

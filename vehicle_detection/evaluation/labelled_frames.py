@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check, fields, invalid, pluralize
+from vehicle_detection._common import check, invalid, pluralize
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.matching import match_names
@@ -64,7 +64,7 @@ class LabelledFrames:
                 "use the same names in both"
             )
         if self.horizon is not None:
-            fields.store_number(self, "horizon", low=0, high=1)
+            object.__setattr__(self, "horizon", check.number(self.horizon, "horizon", low=0, high=1))
         object.__setattr__(self, "labels", labels.select(keys))
 
     def __repr__(self) -> str:
