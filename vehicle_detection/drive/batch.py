@@ -189,9 +189,7 @@ def run_batch(
     check.flags(
         tracks_only=tracks_only, audio=audio, retry_failed=retry_failed, dry_run=dry_run, progress=progress
     )
-    if executor is not None and not hasattr(executor, "submit"):
-        raise invalid("executor", "be an executor of concurrent.futures", executor, "omit it")
-    check.function(on_record, "on_record", "a record")
+    _check_callables(executor, on_record)
     workers = available_cores() if jobs is None else check.integer(jobs, "jobs", low=1, high=1024)
     check.choice(preset, "preset", PRESETS)
     if executor is None and not dry_run:
@@ -227,6 +225,12 @@ def run_batch(
     numbers = {name: counts[status] for name, status in COUNTS.items()}
     numbers |= {"trips": len(tasks), "skipped": counts["skipped"], "frames": counts["frames"]}
     return BatchReport(**numbers, seconds=time.perf_counter() - started, messages=messages, planned=planned)
+
+
+def _check_callables(executor: object, on_record: object) -> None:
+    if executor is not None and not hasattr(executor, "submit"):
+        raise invalid("executor", "be an executor of concurrent.futures", executor, "omit it")
+    check.function(on_record, "on_record", "a record")
 
 
 def _parse_shard(shard: object) -> tuple[int, int]:
