@@ -42,6 +42,14 @@ def test_the_optimum_equals_that_of_scikit_learn(seed, C):
     np.testing.assert_allclose(scores_of(fitted, features), svm.decision_function(scaled), atol=5e-3)
 
 
+def test_a_solution_that_has_not_converged_is_reported(caplog):
+    features, labels = overlapping_clouds()
+    fit_svm(features, labels, np.full(len(labels), 0.1))
+    assert caplog.text == ""
+    fit_svm(features, labels, np.full(len(labels), 1e4))
+    assert "has not converged after 300 sweeps; use a smaller C" in caplog.text
+
+
 def test_other_rows_have_no_effect():
     features, labels = overlapping_clouds()
     rows = np.flatnonzero(np.arange(len(labels)) % 5)

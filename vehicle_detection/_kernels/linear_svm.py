@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,8 @@ from vehicle_detection._kernels.jit import jit
 _CHUNK = 1024
 # As in liblinear: maximum difference of two projected gradients, and maximum number of sweeps.
 _TOLERANCE, _MAX_SWEEPS = 0.002, 300
+
+_LOGGER = logging.getLogger(__name__)
 
 
 class LinearSVM(NamedTuple):
@@ -51,7 +54,9 @@ def fit_svm(
     weights = np.zeros(features.shape[1], np.float32)
     problem = features, chosen, 2.0 * labels[chosen] - 1, 0.5 / costs[chosen]
     rng = np.random.default_rng(random_state)
-    intercept = _descend(*problem, center, squares, weights, _TOLERANCE, _MAX_SWEEPS, rng)
+    intercept, sweeps = _descend(*problem, center, squares, weights, _TOLERANCE, _MAX_SWEEPS, rng)
+    if sweeps == _MAX_SWEEPS:
+        _LOGGER.warning("the SVM has not converged after %d sweeps; use a smaller C", sweeps)
     coef = weights * scale
     # The solver used the mean rounded to float32.
     return LinearSVM(mean, scale, coef, float(intercept + coef / scale @ (mean - center)))
@@ -102,7 +107,9 @@ def _add(step, row, center, squares, weights):
 
 @functools.partial(jit, reorder=True)
 def _descend(features, rows, signs, ridge, center, squares, weights, tolerance, max_sweeps, rng):
-    """Solve the dual problem: update `weights`, those of centered rows, in place and return the intercept.
+    """Solve the dual problem: update `weights`, those of centered rows, in place.
+
+    Returns the intercept, and the number of sweeps, which is `max_sweeps` if it has not converged.
 
     With the score ``f = x @ w + b``, the primal problem is the minimum of ``(|w|^2 + b^2) / 2`` plus the sum
     of ``C_i max(0, 1 - y_i f_i)^2`` over the rows. Its dual has a multiplier ``a_i >= 0`` for each row, with
@@ -118,7 +125,7 @@ def _descend(features, rows, signs, ridge, center, squares, weights, tolerance, 
     intercept = 0.0
     order, active = np.arange(count), count
     bound = np.inf
-    for _ in range(max_sweeps):
+    for sweep in range(max_sweeps):
         highest, lowest = -np.inf, np.inf
         for position in range(active - 1):  # shuffle the active rows
             other = position + int(rng.random() * (active - position))
@@ -147,9 +154,9 @@ def _descend(features, rows, signs, ridge, center, squares, weights, tolerance, 
             position += 1
         if highest - lowest <= tolerance:
             if active == count:
-                break
+                return intercept, sweep
             # The active rows have converged: check the skipped ones as well.
             active, bound = count, np.inf
         else:
             bound = highest if highest > 0 else np.inf
-    return intercept
+    return intercept, max_sweeps

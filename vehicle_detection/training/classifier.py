@@ -79,8 +79,9 @@ def train_classifier(
 ) -> VehicleClassifier:
     """Train a linear SVM behind a feature scaler on patches, or another linear classifier of scikit-learn.
 
-    The SVM is that of ``LinearSVC(C, dual=True)``, with scores within 1e-4, by a solver that needs no copy of
-    the features: on 17,760 patches with 8,460 features a fifth of the time (5 of 24 s) and 4 GB less memory.
+    The SVM is that of ``LinearSVC(C, dual=True)``, with scores within 1e-4 unless a warning says that it has
+    not converged, by a solver that needs no copy of the features: on 17,760 patches with 8,460 features a
+    fifth of the time (5 of 24 s) and 4 GB less memory.
     The model has one template; the same input and seed give the same model.
 
     Parameters
