@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import Floats, check, invalid, pluralize, read_model, write_model
 from vehicle_detection.boxes import Platt
+from vehicle_detection.datasets import check_labels
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.features import PATCH_SIZE, FeatureParams, extract_features
 from vehicle_detection.search import BandFilters, BandSearch, SearchParams
@@ -139,9 +140,10 @@ class VehicleClassifier:
 
     def score(self, X: ArrayLike, y: ArrayLike) -> float:
         """Accuracy, 0 to 1, for ``(N,)`` labels `y`, 1 for a vehicle; `X` as in `decision_function`."""
-        labels, predicted = check.array(y, "y"), self.predict(X)
-        if labels.shape != predicted.shape or not labels.size:
-            raise invalid("y", f"hold one label for each of {len(predicted)} rows (at least one)", labels)
+        predicted = self.predict(X)
+        if not len(predicted):
+            raise invalid("X", "hold at least one row", X)
+        labels = check_labels(y, "y", count=len(predicted), of="rows")
         return float(np.mean(predicted == labels))
 
     def _features_of(self, X: ArrayLike) -> NDArray[Any]:
