@@ -66,7 +66,7 @@ def test_a_trained_classifier_separates_its_patches(trained, patches, labels):
     expected = ((features - template.mean) / template.scale) @ template.coef + template.intercept
     np.testing.assert_allclose(scores, expected, atol=1e-9)
     for X, y in ((patches, [1]), (patches, np.ones((80, 1))), (patches, 2 * labels - 1), (features[:0], [])):
-        with pytest.raises(InvalidInputError, match="y must be 0 or 1, .* the 80 rows|X must hold"):
+        with pytest.raises(InvalidInputError, match=r"y must be 0 or 1, .* 80 rows|X must hold"):
             trained.score(X, y)
     training = trained.metadata["training"]
     assert (training["vehicles"], training["non_vehicles"], training["random_state"]) == (40, 40, 0)

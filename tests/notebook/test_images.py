@@ -33,8 +33,3 @@ def test_patches_of_a_set_show_class_and_source(patch_set):
     assert texts(axes.texts)[-1] == "Road\nscore +39.00"
     colors = [tuple(lines.get_colors()[0][:3]) for lines in axes.collections]
     assert colors == [pytest.approx(VEHICLE if label else OTHER) for label in patch_set.labels[rows]]
-    left, right, bottom, top = np.array([image.get_extent() for image in axes.images]).T
-    assert (right <= axes.get_xlim()[1]).all()
-    assert (bottom <= axes.get_ylim()[0]).all()
-    assert (np.diff(left[:4]) > 0).all()
-    assert top[4] > bottom[0]
