@@ -15,6 +15,7 @@ from vehicle_detection import (
     load_frames,
     process_video,
     read_labels,
+    write_labels,
 )
 from vehicle_detection.tables import TrackTable
 
@@ -25,7 +26,7 @@ def run(context: Context) -> list[Row]:
     if folder is None:
         source, material = clip(context.work)
         truth = context.work / "drive.csv"
-        drawn_drive().write_labels(truth)
+        write_labels(drawn_drive().labels, truth)
         return [replace(row, target=None) for row in _clip_rows("drive", source, truth, material=material)]
     labels, videos = folder / "labels", folder / "videos"
     note = "IoU 0.5; both models were trained on images of this road, which favors them"

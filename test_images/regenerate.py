@@ -11,7 +11,8 @@ from typing import Any
 
 import cv2
 
-from vehicle_detection.scenes import Scene, SceneVehicle, render_scene, write_labels
+from vehicle_detection import write_labels
+from vehicle_detection.scenes import Scene, SceneVehicle, render_scene, truth_table
 
 JPEG_QUALITY = 88
 FOLDER = Path(__file__).parent
@@ -68,13 +69,13 @@ def draw(name: str) -> Scene:
 
 def main(folder: Path) -> None:
     """Write all images and ``labels.csv`` to a folder."""
-    truth = []
+    truth = {}
     for name in SCENES:
         scene = draw(name)
         pixels = cv2.cvtColor(scene.image, cv2.COLOR_RGB2BGR)
         cv2.imwrite(str(folder / name), pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        truth.append((name, scene.truth))
-    write_labels(folder / "labels.csv", truth)
+        truth[name] = scene.truth
+    write_labels(truth_table(truth), folder / "labels.csv")
 
 
 if __name__ == "__main__":

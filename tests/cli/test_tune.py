@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from tests.cli import commands
+from vehicle_detection.datasets import write_labels
 from vehicle_detection.images import read_image, write_image
-from vehicle_detection.scenes import render_scene, write_labels
+from vehicle_detection.scenes import render_scene, truth_table
 from vehicle_detection.training import read_results, tuning
 
 SMALL = "spatial_size=8 hist_bins=8 pix_per_cell=16 hog_channel=0 mirror=no"
@@ -25,7 +26,7 @@ def material(tmp_path_factory):
     (folder / "road").mkdir()
     scene = render_scene(shape=(360, 640), vehicles=2, random_state=1)
     write_image(folder / "road" / "1.png", scene.image)
-    write_labels(folder / "road.csv", [("1.png", scene.truth)])
+    write_labels(truth_table({"1.png": scene.truth}), folder / "road.csv")
     return folder
 
 

@@ -1,13 +1,12 @@
-import csv
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import check_truth
+from vehicle_detection.datasets import read_labels, write_labels
 from vehicle_detection.scenes import render_drive
-from vehicle_detection.scenes.drive import LABEL_COLUMNS, SCENARIOS, make_traffic
+from vehicle_detection.scenes.drive import SCENARIOS, make_traffic
 
 SMALL = (216, 384)
 
@@ -90,19 +89,14 @@ def test_occlusion_hides_a_car_for_about_a_second(frames, seed):
 
 def test_labels_contain_the_truth(tmp_path):
     drive = render_drive(frames=10, shape=SMALL, random_state=2)
-    drive.write_labels(tmp_path / "labels.csv")
-    with (tmp_path / "labels.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert tuple(rows[0]) == LABEL_COLUMNS
+    write_labels(drive.labels, tmp_path / "labels.csv")
+    labels = read_labels(tmp_path / "labels.csv")
     truth = [(frame, row) for frame, found in enumerate(drive.truth) for row in found]
-    assert len(rows) == len(truth)
-    for row, (frame, true) in zip(rows, truth):
-        assert (int(row["frame"]), int(row["track"])) == (frame, true.track)
-        assert tuple(int(row[key]) for key in ("x1", "y1", "x2", "y2")) == true.box
-        assert (int(row["occluded"]), int(row["ignore"])) == (true.occluded, true.ignore)
-        assert float(row["truncated"]) == pytest.approx(true.truncated, abs=5e-4)
-        assert float(row["distance_m"]) == pytest.approx(true.distance_m, abs=5e-3)
-        assert float(row["speed_mps"]) == pytest.approx(true.speed_mps, abs=5e-3)
+    assert len(labels) == len(truth)
+    assert list(zip(labels["frame"], labels["track_id"])) == [(frame, row.track) for frame, row in truth]
+    assert labels.boxes.tolist() == [list(row.box) for _, row in truth]
+    for name in ("occluded", "ignore", "truncated", "distance_m", "speed_mps"):
+        assert labels[name] == pytest.approx([getattr(row, name) for _, row in truth])
 
 
 def test_rough_drives_have_other_widths_a_rolling_camera_and_hills():

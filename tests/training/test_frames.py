@@ -65,7 +65,7 @@ def test_frames_of_a_video_are_sampled_at_the_clip_rate(tmp_path):
     for name in ("labels", "videos"):
         (tmp_path / name).mkdir()
     drive = render_drive(frames=20, shape=(96, 160), fps=10)
-    drive.write_labels(tmp_path / "labels" / "drive.csv")
+    write_labels(drive.labels, tmp_path / "labels" / "drive.csv")
     write_clip(tmp_path / "videos" / "drive.mp4", [scene.image for scene in drive], fps=10)
     (source,) = find_sources(tmp_path, clip_rate=2.0)
     assert (source.name, source.sets[0].keys) == ("drive", (0, 5, 10, 15))

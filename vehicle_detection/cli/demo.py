@@ -100,10 +100,10 @@ def _named_in(folder: Path, temporary: Path) -> Iterator[None]:
 
 def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False) -> None:
     """Write the frames of a drive as a video, and their ground truth as a table, with oncoming vehicles."""
-    from vehicle_detection.scenes import write_labels
+    from vehicle_detection.scenes import truth_table
 
     height, width = drive.shape
-    truth = []
+    truth: dict[int | str, list[VehicleTruth]] = {}
     try:
         # moviepy, because `process_video` needs a source. It looks for ffmpeg when it is imported.
         from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
@@ -114,15 +114,15 @@ def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False)
             FFMPEG_VideoWriter(str(clip), (width, height), drive.fps, preset="veryfast") as writer,
             common.progress_bar(progress, len(drive), unit="frame", interactive_only=True) as bar,
         ):
-            for scene in drive:
-                truth.append(scored_truth(scene.truth))
+            for index, scene in enumerate(drive):
+                truth[index] = scored_truth(scene.truth)
                 writer.write_frame(scene.image)
                 bar.update()
     except OSError as error:  # its text is ffmpeg's log
         full = "No space left" in str(error)
         reason = "the disk is full; free some space" if full else "ffmpeg failed; check the folder"
         raise OutputError(f"{clip} cannot be written: {reason}") from error
-    write_labels(labels, enumerate(truth))
+    vd.write_labels(truth_table(truth), labels)
 
 
 def scored_truth(rows: Sequence[VehicleTruth]) -> list[VehicleTruth]:

@@ -4,7 +4,7 @@ A pinhole camera looks along a flat, straight road; vehicles are painted bodies 
 """
 
 from vehicle_detection.scenes.camera_light import SceneView
-from vehicle_detection.scenes.drive import Drive, render_drive, truth_table, write_labels
+from vehicle_detection.scenes.drive import Drive, render_drive, truth_table
 from vehicle_detection.scenes.render import VehicleTruth
 from vehicle_detection.scenes.scene import Scene, SceneVehicle, render_patches, render_scene
 
@@ -18,5 +18,4 @@ __all__ = [
     "render_patches",
     "render_scene",
     "truth_table",
-    "write_labels",
 ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._common import atomic_write, check
+from vehicle_detection._common import check
 from vehicle_detection.scenes.camera_light import Rng, SceneConfig, SceneView
 from vehicle_detection.scenes.render import VehiclePose, VehicleTruth
 from vehicle_detection.scenes.scene import RandomState, Scene, SceneRenderer, make_generator
@@ -26,11 +25,6 @@ SCENARIOS = (
 # Of rough drives: largest pitch and roll of the camera (radians), curvature of the road (1/m) and the time
 # (s) between two crests, and fraction of trucks.
 _PITCH, _ROLL, _CURVATURE, _CREST_TIME, _TRUCKS = 0.005, 0.013, 1 / 4000, 7.0, 0.1
-
-# Columns of a labels file; the first nine are those of manual labels.
-LABEL_COLUMNS = (
-    "frame", "track", "x1", "y1", "x2", "y2", "occluded", "truncated", "ignore", "distance_m", "speed_mps",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,10 +239,6 @@ class Drive:
         # The speed of the camera is 27 m/s.
         return poses, 27.0 * time, pitch_offset, self._roll * (1 + 0.4 * float(waves[1]))
 
-    def write_labels(self, path: str | os.PathLike[str]) -> None:
-        """Write the ground truth of every frame as CSV; see `write_labels`."""
-        write_labels(path, enumerate(self.truth))
-
 
 def render_drive(
     *,
@@ -315,19 +305,3 @@ def truth_table(frames: Mapping[FrameKey, Sequence[VehicleTruth]]) -> TrackTable
     boxes = np.array([row.box for row in rows], np.float64).reshape(-1, 4)
     tracks = [row.track for row in rows]
     return TrackTable(keys, tracks, boxes, frame_keys=tuple(frames), **columns)
-
-
-def write_labels(
-    path: str | os.PathLike[str], frames: Iterable[tuple[int | str, Sequence[VehicleTruth]]]
-) -> None:
-    """Write the ground truth of frames, given by number or file name, as CSV, one row per vehicle."""
-    import pandas as pd
-
-    lines = [
-        (frame, row.track, *row.box, row.occluded, f"{row.truncated:.3f}", row.ignore,
-         f"{row.distance_m:.2f}", f"{row.speed_mps:.2f}")
-        for frame, rows in frames
-        for row in rows
-    ]  # fmt: skip
-    with atomic_write(path, "path") as part:
-        pd.DataFrame(lines, columns=LABEL_COLUMNS).to_csv(part, index=False, lineterminator="\n")
