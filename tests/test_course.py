@@ -415,12 +415,15 @@ def test_a_changed_model_is_noticed(models):
     assert search() == []
 
 
+@pytest.mark.parametrize("hog_feat", [True, False])
 @pytest.mark.parametrize("hist_range", [(0, 256), None])
-def test_cells_that_do_not_divide_a_window(hist_range):
-    options = {"spatial_size": (16, 16), "hist_bins": 16, "pix_per_cell": 12, "hist_range": hist_range}
+def test_cells_that_do_not_divide_a_window(hist_range, hog_feat):
+    """Without HOG, too, they set the step between windows."""
+    shared = {"hist_range": hist_range, "hog_feat": hog_feat}
+    options = {"spatial_size": (16, 16), "hist_bins": 16, "pix_per_cell": 12, **shared}
     model = trained(reference.extract_features(PATCHES, "YCrCb", **options))
     arguments = (FRAMES["uint8"], 60, 200, 1, *model, 9, 12, 2, (16, 16), 16)
-    keywords = {"hog_channel": 0, "formula": "new", "divide_by": 1, "hist_range": hist_range}
+    keywords = {"hog_channel": 0, "formula": "new", "divide_by": 1, **shared}
     found, expected = (module.find_car_windows(*arguments, **keywords) for module in (lesson, reference))
     assert found == expected
 

@@ -7,7 +7,7 @@ import functools
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, dataclass
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import cv2
 import numpy as np
@@ -36,7 +36,7 @@ Size = int | Sequence[int]
 _OPENCV_SPACES = {space.upper(): space for space in (*COLOR_SPACES, "BGR", "GRAY")}
 _CHUNK = 4096  # number of images that are read and processed at a time
 # Values of the options of a group of features that is switched off.
-_UNUSED: dict[str, dict[str, Any]] = {
+UNUSED: dict[str, dict[str, Any]] = {
     "spatial_feat": {"spatial_size": (32, 32)},
     "hist_feat": {"hist_bins": 32, "hist_range": (0, 256)},
     "hog_feat": {"orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "hog_channel": 0},
@@ -424,6 +424,8 @@ def _reader(imread: str | Callable[[str], Image], channel_order: str) -> Callabl
 class FeatureOptions(fields.Checked):
     """The feature options of a lesson function, checked."""
 
+    unused: ClassVar = UNUSED
+
     color_space: str = fields.choice(MISSING, COLOR_SPACES)
     spatial_size: tuple[int, int] = fields.checked_field(MISSING, check_size)  # (width, height)
     hist_bins: int = fields.integer(low=1)
@@ -439,7 +441,7 @@ class FeatureOptions(fields.Checked):
     spatial_order: Literal["interleaved", "channels"] = fields.choice(MISSING, SPATIAL_ORDERS)
 
     def __post_init__(self) -> None:
-        for switch, unused in _UNUSED.items():  # the lesson's code does not read them
+        for switch, unused in self.unused.items():  # the lesson's code does not read them
             if not check_switch(getattr(self, switch), switch):
                 for name, value in unused.items():
                     object.__setattr__(self, name, value)

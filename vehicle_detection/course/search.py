@@ -12,7 +12,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import describe, fields, invalid, warn
 from vehicle_detection.course.features import (
+    UNUSED,
     FeatureOptions,
     Image,
     Size,
@@ -269,6 +270,9 @@ def find_car_windows(*args: Any, **options: Any) -> list[Corners]:
 @dataclass(frozen=True, kw_only=True)
 class _SearchOptions(FeatureOptions):
     """The options of `find_cars`, checked."""
+
+    # The step between windows depends on the cells of HOG, whether it is used or not.
+    unused: ClassVar = UNUSED | {"hog_feat": {"orient": 9, "hog_channel": 0}}
 
     ystart: int | None = fields.integer(None, low=0)
     ystop: int | None = fields.integer(None, low=0)
