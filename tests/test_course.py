@@ -790,6 +790,11 @@ def test_a_model_of_the_library_needs_its_own_features():
         lesson.find_car_windows(*band, svc, scaler, *options)
 
 
+def test_gray_images_have_a_histogram_of_their_own_range():
+    gray = np.repeat(PATCHES[0][..., :1], 3, axis=2) / np.float32(255)
+    assert lesson.color_hist(lesson.convert_color(gray), bins_range=None).sum() == 3 * 64**2
+
+
 def test_files_of_both_ranges_warn():
     with pytest.warns(UserWarning, match='0-1 and 0-255, which do not mix.*imread="cv2"'):
         lesson.extract_features([PATCHES[0], PATCHES[1] / 255], hist_range=None)

@@ -240,7 +240,13 @@ def color_hist(
 def _histogram(image: Image, bins: int, limits: tuple[float, float] | None) -> NDArray[np.int64]:
     """Histogram of each channel, one after the other; None is the range of the channel's values."""
     if limits is None:
-        return np.concatenate([np.histogram(image[..., channel], bins)[0] for channel in range(3)])
+        try:
+            return np.concatenate([np.histogram(image[..., channel], bins)[0] for channel in range(3)])
+        except ValueError:
+            if image.dtype != np.float32:
+                raise
+            # The colors of a gray image may differ by roundings only, too little for edges in float32.
+            return _histogram(image.astype(np.float64), bins, None)
     separate = (bin_indices(image, bins, limits) + np.arange(3) * (bins + 1)).ravel()
     return np.bincount(separate, minlength=3 * (bins + 1)).reshape(3, -1)[:, :bins].ravel()
 
