@@ -142,7 +142,7 @@ def test_a_box_that_a_nearer_vehicle_covers_is_a_weaker_measurement():
         for box, fraction in ((boxes, 0.0), (boxes, 0.0), (width, covered)):
             measured = Measurements.from_boxes(box, SHAPE, covered=fraction)
             states = update_distances(states, measured, CAMERA, 0.08, 0.04)
-        return states.range_mean[0, 0], states.range_cov[0, 0, 0]
+        return states.range_mean[0, 0], states.range_cov[0, 0, 0] / states.range_mean[0, 0] ** 2
 
     visible, partial, hidden = distance(0.0), distance(0.1), distance(0.5)
     # The narrower a box, the farther the vehicle seems.
@@ -244,3 +244,11 @@ def test_the_distance_of_a_vehicle_whose_side_is_visible_is_that_of_its_rear_at_
         if track.distance_m is not None:
             assert abs(track.distance_m - 19) < min(track.distance_std_m, 5)
     assert track.distance_m is not None
+
+
+def test_a_distance_does_not_drift_while_a_vehicle_brakes_and_accelerates():
+    tracker, ratios = Tracker(fps=10, camera=Camera.dashcam(fov=58)), []
+    for distance in 15 + 2 * np.sin(2 * math.pi * np.arange(400) / 50):
+        (track,) = tracker.update(Detections([box_at(distance)], [5.0]), SHAPE)
+        ratios.append((track.distance_m or math.nan) / distance)
+    assert np.mean(ratios[-50:]) == pytest.approx(1, abs=0.07)

@@ -328,7 +328,25 @@ def _scalar_update(
     expected = (jacobian * cross).sum(axis=1)  # h P h'
     penalty = np.maximum(np.square(innovation) / (expected + variance) / _OUTLIER**2, 1.0)
     gain = cross / (expected + variance * penalty)[:, None]
-    return mean + gain * innovation[:, None], cov - gain[:, :, None] * cross[:, None, :]
+    corrected = mean + gain * innovation[:, None]
+    return corrected, _rescale(cov - gain[:, :, None] * cross[:, None, :], mean, corrected)
+
+
+def _rescale(cov: Floats, before: Floats, mean: Floats) -> Floats:
+    """Change the covariance, in place, as a correction of the mean changes scales: relative errors stay.
+
+    It is then that of ``log(distance)`` and ``speed / distance``. Boxes show only the latter while sizes are
+    unknown; with the old scales, each acceleration would make all sizes, and so the distance, smaller (Aidala
+    and Hammel, "Utilization of modified polar coordinates for bearings-only tracking", *IEEE Transactions on
+    Automatic Control*, 1983).
+    """
+    (distance, speed), (new_distance, new_speed) = before.T[:2], mean.T[:2]
+    ratio = np.maximum(new_distance, _MIN_DISTANCE) / distance
+    shear = (new_speed - ratio * speed) / distance
+    for rows in (cov, cov.transpose(0, 2, 1)):
+        rows[:, SPEED] = ratio[:, None] * rows[:, SPEED] + shear[:, None] * rows[:, DISTANCE]
+        rows[:, DISTANCE] *= ratio[:, None]
+    return cov
 
 
 def estimate_distances(
