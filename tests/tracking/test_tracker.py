@@ -706,7 +706,7 @@ class TestPrediction:
             detections = found(*(box + rng.normal(0, 2, 4) for box in boxes if rng.random() < 0.8))
             first, second = one.update(detections, SHAPE), other.update(detections, SHAPE)
             for predicted in (other.predict(), other.predict(time=index / 25 + 0.7)):
-                assert [track.id for track in predicted] == [track.id for track in second if track.id]
+                assert [track.key for track in predicted] == [track.key for track in second]
                 for track in predicted:
                     assert_valid(track)
             assert_equal(first, second)
@@ -721,11 +721,12 @@ class TestPrediction:
         for name in ("age", "time_since_update", "velocity", "distance_m"):
             assert getattr(predicted, name) == pytest.approx(getattr(track, name)), name
 
-    def test_only_confirmed_tracks_inside_the_frame_are_predicted(self):
+    def test_tracks_inside_the_frame_are_predicted(self):
         tracker = Tracker()
         assert tracker.predict() == tracker.predict(time=3.0) == ()
         tracker.update(found(CAR, score=0.1), SHAPE)
-        assert tracker.predict() == ()  # tentative
+        (tentative,) = tracker.predict()  # to blur it
+        assert (tentative.id, tentative.state, tentative.shown) == (0, "tentative", False)
         self.drive(tracker, 75)
         assert tracker.predict(time=30.0) == ()  # beyond the right edge of the frame
         tracker.end_tracks()

@@ -316,10 +316,10 @@ class Tracker:
         return found[:_MAX_DETECTIONS]
 
     def predict(self, *, time: float | None = None, frames: int = 1) -> tuple[Track, ...]:
-        """Estimate where the confirmed tracks will be, without changing the state of the tracker.
+        """Estimate where the tracks will be, without changing the state of the tracker.
 
         `time` is in seconds, not before the last frame; by default `frames` frames after it. Returns the
-        tracks by id, as `update` would if nothing was detected: the state is ``"coasting"``, and ages and
+        tracks as `update` would if nothing was detected: confirmed ones are ``"coasting"``, and ages and
         misses have grown; score and ``shown`` are those of the last frame. A track that has left the frame by
         then is left out.
 
@@ -334,18 +334,18 @@ class Tracker:
         dt = check.integer(frames, "frames", low=1) * self._frame_seconds
         if time is not None:
             dt = check.number(time, "time", low=last, high=1e12) - last
-        confirmed = [row for row, track in enumerate(self._live) if track.id]
-        if self._shape is None or not confirmed:
+        if self._shape is None or not self._live:
             return ()
         if dt == 0:
-            return self._tracks[: len(confirmed)]
-        coasting = np.array([self._live[row].misses > 0 for row in confirmed])
-        states = self._smoother.predict(self._states.take(confirmed), coasting, dt)
+            return self._tracks
+        coasting = np.array([track.misses > 0 for track in self._live])
+        states = self._smoother.predict(self._states, coasting, dt)
         tracks = []
         for track in self._snapshot(self._shape, predict_distances(states, dt, self.camera), dt):
             times: Any = {"age": track.age + dt, "time_since_update": track.time_since_update + dt}
             if box_areas(track.box[None]) >= 1:
-                tracks.append(replace(track, state="coasting", misses=track.misses + 1, **times))
+                state: Any = "coasting" if track.id else "tentative"
+                tracks.append(replace(track, state=state, misses=track.misses + 1, **times))
         return tuple(tracks)
 
     def _advance(self, frame: FrameShape, time: float | None, frames: int) -> float:
@@ -569,8 +569,8 @@ class Tracker:
         self._horizon.update(ids[visible], road_boxes, frame, dt)
 
     def _snapshot(self, frame: FrameShape, states: KalmanStates, dt: float = 0.0) -> tuple[Track, ...]:
-        """Return the first tracks, whose states have been predicted by `dt` seconds."""
-        boxes, live = _clip(states.boxes(), frame), self._live[: len(states.mean)]
+        """Return the tracks, whose states have been predicted by `dt` seconds."""
+        boxes, live = _clip(states.boxes(), frame), self._live
         boxes.setflags(write=False)
         gap = np.array([track.time_since_update + dt for track in live])
         confidences = [None] * len(live)
