@@ -8,6 +8,7 @@ import pytest
 
 from tests.network.graphs import constant_network, spot_network
 from vehicle_detection import (
+    Annotator,
     FeatureParams,
     NetworkParams,
     VehicleDetector,
@@ -153,6 +154,17 @@ def test_a_detected_box_of_a_track_is_explained(detector, tmp_path, seconds, fra
     assert (picture.track, picture.frame) == (1, frame)
     assert picture.text.startswith("A vehicle is found here")
     assert "not found" not in picture.text
+
+
+def test_a_picture_of_a_blurred_video_blurs_tracks_that_are_not_detected(detector, tmp_path):
+    write_image(tmp_path / "0.png", SCENE.image)
+    box, pictures = detector.detect(SCENE.image).boxes[0], []
+    blurring = VehicleDetector(detector.detector, annotator=Annotator(blur="vehicles"))
+    for boxes in [box], [box, box + 30]:
+        table = TrackTable()
+        table.append(0, 0.0, [SimpleNamespace(id=row, box=each) for row, each in enumerate(boxes, 1)])
+        pictures.append(explain_tracks(blurring, tmp_path, table)[0].image)
+    assert (pictures[0] != pictures[1]).any()
 
 
 @pytest.mark.parametrize(

@@ -288,17 +288,20 @@ def explain_tracks(detector: VehicleDetector, source: Source, table: TrackTable)
             with opened.read(offset + frame, 1) as frames:
                 for _, _, image in frames:
                     explanation = explain(detector, image, track.boxes[row])
-                    picture = _draw_explanation(detector, image, explanation)
+                    picture = _draw_explanation(detector, image, explanation, table.frame(frame).boxes)
                     pictures.append(TrackPicture(track.id, frame, picture, explanation.describe()))
     return sorted(pictures, key=lambda picture: picture.track)
 
 
 def _draw_explanation(
-    detector: VehicleDetector, image: NDArray[np.uint8], explanation: Explanation
+    detector: VehicleDetector, image: NDArray[np.uint8], explanation: Explanation, tracked: Floats
 ) -> NDArray[np.uint8]:
-    """Draw an explained box twice, side by side: as it is, and with the shares of its cells."""
+    """Draw an explained box twice, side by side: as it is, and with the shares of its cells.
+
+    `tracked` are the boxes of all tracks in the frame, which may have to be blurred, too.
+    """
     if detector.annotator.blur is not None:
-        boxes = np.concatenate([detector.detect(image).boxes, explanation.box[None]])
+        boxes = np.concatenate([detector.detect(image).boxes, tracked, explanation.box[None]])
         image = blur_boxes(image, boxes, region=detector.annotator.blur)
     both = np.stack([explanation.window, explanation.box])
     around = _AROUND * (both[:, 2:].max(axis=0) - both[:, :2].min(axis=0)).max()
