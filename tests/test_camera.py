@@ -220,7 +220,7 @@ def test_a_camera_of_another_size_rectifies_as_one_of_this_size(lens):
 @pytest.mark.parametrize(
     ("stated", "warning"),
     [
-        ({"fov": 140}, "may be that along the diagonal"),
+        ({"fov": 120}, "choose a fisheye lens"),
         ({"height_m": 0.13}, "height of 0.13 m is unusual"),
         ({"height_m": 13}, "height of 13 m is unusual"),
         ({"fov": 110, "height_m": 3.2}, ""),

@@ -55,7 +55,7 @@ _GIVEN_HEIGHT_STD = 0.05
 # Horizon of an unknown camera, its standard error, that of a given horizon, and the largest one of a horizon
 # that counts as known; fractions of the frame's height. The first is that of a level camera.
 _HORIZON, _HORIZON_STD, _GIVEN_HORIZON_STD, _KNOWN_HORIZON_STD = 0.5, 0.06, 0.004, 0.02
-# Field of view (degrees) above which lenses distort, and usual heights of cameras in cars and trucks (m).
+# Field of view (degrees) from which on lenses distort, and usual heights of cameras in cars and trucks (m).
 _MAX_PINHOLE_FOV, _HEIGHTS = 120.0, (0.6, 3.5)
 # Largest angle from the optical axis (radians) at which boxes are converted to a pinhole camera.
 _MAX_ANGLE = math.radians(80)
@@ -378,9 +378,9 @@ def open_camera(
     396.00000000000006
     """
     named = camera is None or (isinstance(camera, str) and camera in LENSES)
-    if isinstance(fov, (int, float)) and _MAX_PINHOLE_FOV < fov <= 170:
-        advice = "state that along the longer side, or choose a fisheye lens"
-        _LOGGER.warning("a field of view of %g degrees may be that along the diagonal; %s", fov, advice)
+    if isinstance(fov, (int, float)) and _MAX_PINHOLE_FOV <= fov <= 170:
+        advice = "choose a fisheye lens, or distances may be a third too short"
+        _LOGGER.warning("a lens of %g degrees distorts, or that is its diagonal; %s", fov, advice)
     if isinstance(height_m, (int, float)) and (0 < height_m < _HEIGHTS[0] or _HEIGHTS[1] < height_m <= 100):
         _LOGGER.warning("a camera height of %g m is unusual; distances are proportional to it", height_m)
     for name, value, allowed in (
