@@ -1,7 +1,5 @@
 """Counts by minute."""
 
-import dataclasses
-
 from tests.drive.report_helpers import track
 from vehicle_detection import TrackTable, count_vehicles
 from vehicle_detection.drive import Event
@@ -30,8 +28,3 @@ def test_counts_are_the_sums_of_their_minutes():
     assert counts.summary().startswith(
         "overtook 1 vehicle, was overtaken by 1, met 2 oncoming, passed 1 other; 1.6 vehicles in view"
     )
-
-
-def test_an_empty_drive_has_no_minutes():
-    counts = count_vehicles([], TrackTable(), fps=25)
-    assert (counts.minutes, dataclasses.astuple(counts.total)) == ((), (0, 0, 0, 0, 0, 0, 0, 0))

@@ -34,7 +34,6 @@ def test_csv_and_json_hold_the_same(tmp_path):
     ("events", "name", "message"),
     [
         (EVENTS, "events.txt", "path must end in .csv or .json, got 'events.txt'; write 'events.csv'"),
-        (EVENTS, "none/events.csv", "path needs an existing folder"),
         ([1], "events.csv", "events must be an Event, got 1; pass what find_events returned"),
     ],
 )
@@ -44,17 +43,13 @@ def test_bad_files_are_refused(events, name, message, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_clips_show_the_frames_around_each_event(tmp_path, monkeypatch, capsys):
+def test_clips_show_the_frames_around_each_event(tmp_path):
     video = tmp_path / "found.mp4"
     write_clip(video, [np.full((64, 96, 3), frame * 4, np.uint8) for frame in range(50)])
     (tmp_path / "clips").mkdir()
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    first, second = cut_clips(EVENTS, video, tmp_path / "clips", fps=25, margin=0.2, progress=True)
-    assert "2/2" in capsys.readouterr().err
+    first, second = cut_clips(EVENTS, video, tmp_path / "clips", fps=25, margin=0.2)
     assert [first.name, second.name] == ["0000.8s_cut_in_2.mp4", "0002.0s_met_3.mp4"]
     assert probe_video(first).frames == 12 + 1 + 10
     assert probe_video(second).frames == 5 + 1 + 5
     with pytest.raises(InvalidInputError, match=r"folder .* does not exist; create it"):
         cut_clips(EVENTS, video, tmp_path / "none", fps=25)
-    with pytest.raises(InvalidInputError, match="margin must be a number, at least 0"):
-        cut_clips(EVENTS, video, tmp_path, fps=25, margin=-1)

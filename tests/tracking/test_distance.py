@@ -127,10 +127,8 @@ def test_distances_and_speeds_are_stated_where_they_are_known(distance_std, spee
     (found,) = estimate_distances(states, np.array([age]), camera)
     distance = (20.0, math.hypot(distance_std, 2.0)) if known[0] else (None, None)
     speed = (-3.0, math.hypot(speed_std, 0.3)) if known[1] else (None, None)
-    names = ["distance_m", "distance_std_m", "speed_mps", "speed_std_mps"]
-    assert list(found) == names
-    for name, value in zip(names, (*distance, *speed)):
-        assert found[name] == (value if value is None else pytest.approx(value))
+    for value, expected in zip(found.values(), (*distance, *speed), strict=True):
+        assert value == (expected if expected is None else pytest.approx(expected))
 
 
 def test_a_box_that_a_nearer_vehicle_covers_is_a_weaker_measurement():

@@ -739,8 +739,6 @@ class TestPrediction:
         assert tracker.predict(time=5 + 19 / 25) == tracks
         with pytest.raises(InvalidInputError, match=r"time must be a number, at least 5\.76"):
             tracker.predict(time=5.5)
-        with pytest.raises(InvalidInputError, match="time must be a number"):
-            tracker.predict(time="now")
 
 
 class TestDeterminism:
@@ -769,14 +767,10 @@ class TestDeterminism:
 class TestArguments:
     def test_rejects_malformed_frames_and_keeps_its_state(self):
         tracker = after(10)
-        with pytest.raises(InvalidInputError, match=r"detections must be a Detections, .*pass Detections"):
-            tracker.update([CAR], SHAPE)
-        with pytest.raises(InvalidInputError, match=r"shape must be \(height, width, ...\)"):
-            tracker.update(found(CAR), 720)
-        with pytest.raises(InvalidInputError, match="time must be a number"):
-            tracker.update(found(CAR), SHAPE, time=math.nan)
-        with pytest.raises(InvalidInputError, match="gray must be an array"):
-            tracker.update(found(CAR), SHAPE, gray=[1, [2, 3]])
+        good = {"detections": found(CAR), "shape": SHAPE}
+        for name, value in ("detections", [CAR]), ("shape", 720), ("time", math.nan), ("gray", [1, [2, 3]]):
+            with pytest.raises(InvalidInputError, match=f"{name} must be"):
+                tracker.update(**good | {name: value})
         (track,) = tracker.update(found(CAR), SHAPE)
         assert (track.id, track.misses) == (1, 0)
 
@@ -789,8 +783,6 @@ class TestArguments:
         assert track.box.dtype == np.float64
         with pytest.raises(ValueError, match="read-only"):
             track.box[0] = 1
-        with pytest.raises(AttributeError):
-            track.id = 7
 
 
 def test_a_track_keeps_its_key_when_it_is_confirmed():
