@@ -30,6 +30,7 @@ from vehicle_detection._common import (
     local_path,
     natural_key,
     read_regular_file,
+    walk_files,
 )
 from vehicle_detection.errors import InvalidInputError
 
@@ -273,7 +274,7 @@ def list_images(source: Any) -> Sequence[Any] | None:
         return None
     path = check.path(source)
     if path.is_dir():
-        files = [Path(folder, name) for folder, _, names in os.walk(path) for name in names]
+        files = list(walk_files(path, "image"))
     elif not path.exists() and glob.has_magic(str(path)):
         files = [Path(file) for file in glob.iglob(str(path), recursive=True)]
     else:

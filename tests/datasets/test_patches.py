@@ -138,8 +138,11 @@ def test_jpeg_patches_are_read_and_other_files_are_not(tmp_path):
     (folder / ".hidden.png").write_bytes(b"no patch")
     (folder / ".cache").mkdir()
     (folder / ".cache" / "4.png").write_bytes(b"no patch")
+    (tmp_path / "more").mkdir()
+    (folder / "3.png").rename(tmp_path / "more" / "3.png")
+    (folder / "linked").symlink_to(tmp_path / "more")
     patches = load_patches(folder)
-    assert patches.names == ("cars/1.jpg", "cars/2.JPEG", "cars/3.png")
+    assert patches.names == ("cars/1.jpg", "cars/2.JPEG", "cars/linked/3.png")
     assert np.abs(patches.patches.astype(int) - 200).max() <= 1
 
 
@@ -217,7 +220,7 @@ def test_an_unreadable_folder_is_not_skipped(vehicles_zip, tmp_path, monkeypatch
         return scandir(path)
 
     monkeypatch.setattr(os, "scandir", forbid)
-    with pytest.raises(DatasetError, match=r"GTI_Far cannot be .*Permission denied; check its permissions"):
+    with pytest.raises(DatasetError, match=r"GTI_Far cannot be .*Permission denied.*change its permissions"):
         load_patches(folder)
 
 

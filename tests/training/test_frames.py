@@ -37,6 +37,7 @@ def test_find_sources(tmp_path):
     write_frame_set(tmp_path, "town", drawn(range(3)))
     write_frame_set(tmp_path, "coast", drawn(range(2)))
     write_frame_set(tmp_path, "stills", drawn(range(4)), place=".")
+    (tmp_path / "labels" / "._town.csv").write_bytes(b"of macOS")
     found = find_sources(tmp_path)
     assert [source.name for source in found] == ["coast", "stills", "town"]
     assert [[len(part) for part in source.sets] for source in found] == [[2], [4], [3]]

@@ -11,6 +11,7 @@ from vehicle_detection._common.files import (
     open_locked,
     private_folder,
     temporary_folder,
+    walk_files,
     write_text,
 )
 from vehicle_detection._common.keywords import suggest_keywords, synonyms

@@ -74,6 +74,27 @@ def is_hidden(name: str) -> bool:
     return any(part.startswith(".") or part.lower() in _SYSTEM_FOLDERS for part in name.split("/"))
 
 
+def walk_files(
+    folder: Path, name: str = "source", *, error: type[VehicleDetectionError] = InvalidInputError
+) -> Iterator[Path]:
+    """Yield the files of a folder and below that are not hidden, each once, also where links lead to folders.
+
+    A folder that cannot be read is an `error`, not an empty one; `name` is that of the argument.
+    """
+
+    def refuse(reason: OSError) -> None:
+        text = f"{name} {reason.filename} cannot be listed ({reason.strerror}); change its permissions"
+        raise error(text) from reason
+
+    visited = set[str]()
+    for parent, folders, files in os.walk(folder, onerror=refuse, followlinks=True):
+        place = os.path.realpath(parent)
+        folders[:] = [] if place in visited else sorted(each for each in folders if not is_hidden(each))
+        if place not in visited:
+            yield from (Path(parent, each) for each in files if not is_hidden(each))
+        visited.add(place)
+
+
 @contextlib.contextmanager
 def atomic_write(target: str | os.PathLike[str], name: str = "target") -> Iterator[Path]:
     """Yield a temporary path beside `target`, renamed to `target` if the block succeeds.

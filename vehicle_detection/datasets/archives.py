@@ -30,6 +30,7 @@ from vehicle_detection._common import (
     progress_bar,
     read_regular_file,
     resolve_jobs,
+    walk_files,
 )
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import IMAGE_SUFFIXES, decode_image
@@ -131,12 +132,7 @@ def list_patches(source: str | os.PathLike[str], name: str) -> Listing:
 
 def _list_folder(folder: Path) -> dict[str, str]:
     """Map names of images, which start with the folder's name, to paths relative to the folder."""
-
-    def stop(error: OSError) -> None:
-        raise DatasetError(f"{error.filename} cannot be read: {error.strerror}; check its permissions")
-
-    walk = os.walk(folder, onerror=stop)
-    paths = [Path(parent, file) for parent, _, files in walk for file in files]
+    paths = walk_files(folder, "folder", error=DatasetError)
     members = [path.relative_to(folder).as_posix() for path in paths]
     folder_name = Path(os.path.abspath(folder)).name
     return {f"{folder_name}/{member}": member for member in members if is_image(member)}

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any, NamedTuple
 
-from vehicle_detection._common import Limit, read_regular_file, shorten
+from vehicle_detection._common import Limit, is_hidden, read_regular_file, shorten
 from vehicle_detection.boxes import VEHICLE_CLASSES
 from vehicle_detection.datasets.archives import is_image
 from vehicle_detection.errors import DatasetError
@@ -104,6 +104,7 @@ def label_files(folder: Path) -> list[Path]:
         file
         for file in folder.glob("*.txt")
         if file.name != "classes.txt"
+        and not is_hidden(file.name)
         and not file.name.startswith("README")
         and not (file.stem in _LISTS and all(is_image(PurePath(line).name) for _, line in read_lines(file)))
     ]

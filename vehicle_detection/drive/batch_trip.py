@@ -33,6 +33,7 @@ from vehicle_detection._common import (
     open_parquet,
     stable_url,
     temporary_folder,
+    walk_files,
 )
 from vehicle_detection.annotator import Annotator
 from vehicle_detection.camera import open_camera
@@ -57,7 +58,6 @@ from vehicle_detection.video import (
     open_source,
     process_video,
     select_videos,
-    walk_files,
     with_retries,
 )
 

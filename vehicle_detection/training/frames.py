@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check, invalid
+from vehicle_detection._common import check, invalid, is_hidden
 from vehicle_detection.datasets import load_frames, read_labels
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, match_names
@@ -88,7 +88,8 @@ def find_sources(folder: str | os.PathLike[str], *, clip_rate: float = 3.0) -> l
     root = Path(folder)
     if not root.is_dir():
         raise DatasetError(f"folder {root} does not exist; pass the folder of the labelled frames")
-    files = sorted(path for path in root.glob("labels/*") if path.suffix.lower() in _LABEL_SUFFIXES)
+    listed = (path for path in root.glob("labels/*") if not is_hidden(path.name))  # as macOS adds some
+    files = sorted(path for path in listed if path.suffix.lower() in _LABEL_SUFFIXES)
     if not files:
         raise DatasetError(
             f"folder {root} has no labels/NAME.csv (or {', '.join(_LABEL_SUFFIXES[1:])}); pass the folder of "

@@ -8,7 +8,6 @@ from .files import is_video_file as is_video_file
 from .files import list_files as list_files
 from .files import open_filesystem as open_filesystem
 from .files import select_videos as select_videos
-from .files import walk_files as walk_files
 from .files import with_retries as with_retries
 from .horizon import estimate_video_horizon as estimate_video_horizon
 from .opening import Source as Source

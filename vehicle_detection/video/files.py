@@ -7,7 +7,7 @@ import glob
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 from urllib.parse import unquote
@@ -16,11 +16,11 @@ from vehicle_detection._common import (
     check,
     check_regular_file,
     hide_credentials,
-    is_hidden,
     is_url,
     is_web_address,
     natural_key,
     read_http,
+    walk_files,
     without_query,
 )
 from vehicle_detection.errors import InvalidInputError, TransientVideoError
@@ -80,26 +80,6 @@ def select_videos(files: Iterable[Path]) -> list[Path]:
     sources = {each.with_suffix("") for each in videos}
     copies = ((each, _COPY.fullmatch(each.name)) for each in videos)
     return [each for each, copy in copies if copy is None or each.with_name(copy[1]) not in sources]
-
-
-def walk_files(folder: Path, name: str = "source") -> Iterator[Path]:
-    """Yield the files of a folder and below that are not hidden, each once, also where links lead to folders.
-
-    A folder that cannot be read is an error, not an empty one; `name` is that of the argument.
-    """
-
-    def refuse(error: OSError) -> None:
-        raise InvalidInputError(
-            f"{name} {error.filename} cannot be listed ({error.strerror}); change its permissions"
-        ) from error
-
-    visited = set[str]()
-    for parent, folders, files in os.walk(folder, onerror=refuse, followlinks=True):
-        place = os.path.realpath(parent)
-        folders[:] = [] if place in visited else sorted(each for each in folders if not is_hidden(each))
-        if place not in visited:
-            yield from (Path(parent, each) for each in files if not is_hidden(each))
-        visited.add(place)
 
 
 def check_file(path: str | os.PathLike[str]) -> Path:
