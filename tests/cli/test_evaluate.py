@@ -70,6 +70,8 @@ def test_evaluate_notes_boxes_in_frames_without_labels(tmp_path):
     assert "2 found, 0 missed, 0 false" in succeed("evaluate", labels, found)  # a constant may be a flag
     found.write_text(f"{HEADER}\n" + "".join(f"{n},1,10,10,60,50,1.{n}\n" for n in (0, 6)))
     assert f"note: {found} has scores, as results do" in run("evaluate", found, found).stderr
+    found.write_text(f"{HEADER}\n0,1,20,20,120,100,1\n6,1,20,20,120,100,1\n")
+    assert "note: no box is on a label; check" in run("evaluate", found, labels).stderr
 
 
 def test_evaluate_reads_yolo_folders_with_the_sizes_of_images(tmp_path):

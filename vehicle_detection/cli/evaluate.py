@@ -76,8 +76,11 @@ def evaluate(
     if scored:
         print_error(f"note: {labels} has scores, as results do; its boxes are taken for true ones")
     _note_frames_of_one_file(found, true, chosen, predictions, labels)
-    for boxes, count, file in zip((found, true), unknown, (predictions, labels)):
-        if 0 < count < (~boxes["ignore"]).sum():
+    boxes = scores["detections"]
+    if boxes.fp and boxes.fn and not boxes.tp:
+        print_error("note: no box is on a label; check that image sizes and frame numbers agree")
+    for side, count, file in zip((found, true), unknown, (predictions, labels)):
+        if 0 < count < (~side["ignore"]).sum():
             noun = "box has" if count == 1 else "boxes have"
             print_error(f"note: the tracks are not scored: {count} {noun} no track in {file}")
     if json is not None:
