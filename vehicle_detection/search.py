@@ -509,7 +509,8 @@ class BandFilters:
         cells = kernels.hog_cells(source, *options, workspace)
         maps = [kernels.hog_blocks(cells, params.cell_per_block, 1, workspace)]
         if self.coarse:
-            maps.append(kernels.hog_blocks(kernels.pool_cells(cells), params.cell_per_block, 2, workspace))
+            pooled = kernels.pool_cells(cells, workspace)
+            maps.append(kernels.hog_blocks(pooled, params.cell_per_block, 2, workspace))
         return [blocks.reshape(-1, *cells.shape[2:]) for blocks in maps]
 
     def _value_map(self, image: NDArray[Any]) -> NDArray[np.float32]:

@@ -198,20 +198,28 @@ def sum_orientations(gx, gy, angles, bounds, channels, cell, cells):
     cells *= np.float32(1.0 / (cell * cell))
 
 
-def pool_cells(cells: NDArray[np.float32]) -> NDArray[np.float32]:
+def pool_cells(cells: NDArray[np.float32], workspace: Workspace = NEW_ARRAYS) -> NDArray[np.float32]:
     """Average each cell with its neighbors to the right, below and diagonally: cells of twice the side.
 
     ``pooled[c, k, y, x]`` is the mean of ``cells[c, k, y : y + 2, x : x + 2]``; the last row and column are
     zero.
     """
-    pooled = np.zeros_like(cells)
-    columns, flat, sums = cells.shape[-1], cells.reshape(-1), pooled.reshape(-1)
-    # Adjacent values are added as vectors, also across the ends of rows, which are cleared then.
-    pairs = flat[:-1] + flat[1:]
-    np.add(pairs[:-columns], pairs[columns:], out=sums[: -columns - 1])
-    pooled *= np.float32(0.25)
-    pooled[..., -1:, :], pooled[..., -1] = 0, 0
+    pooled: NDArray[np.float32] = workspace.take(cells.shape, np.float32, "pooled")
+    pooled[..., -1:, :], pooled[..., -1:] = 0, 0
+    shape = -1, *cells.shape[2:]
+    mean_cells(cells.reshape(shape), pooled.reshape(shape))
     return pooled
+
+
+@jit
+def mean_cells(cells, pooled):
+    """Fill ``(maps, rows, columns)`` but its last row and column with means; see `pool_cells`."""
+    one, quarter = np.uintp(1), np.float32(0.25)
+    for k in range(cells.shape[0]):
+        for y in range(cells.shape[1] - 1):
+            upper, lower, out = cells[k, y], cells[k, y + 1], pooled[k, y]
+            for x in range(np.uintp(cells.shape[2] - 1)):
+                out[x] = ((upper[x] + upper[x + one]) + (lower[x] + lower[x + one])) * quarter
 
 
 def hog_blocks(
@@ -235,41 +243,44 @@ def hog_blocks(
     height, width = rows - (block - 1) * dilation, columns - (block - 1) * dilation
     blocks[..., height:, :], blocks[..., width:] = 0, 0
     # Positions count through all rows; blocks across the ends of rows are not used.
-    flat = cells.reshape(channels, orient, -1)
     offsets = [(i * columns + j) * dilation for i in range(block) for j in range(block)]
-    count = max(0, rows * columns - offsets[-1])
-    memory = workspace.take(flat.shape, np.float32, "squares")
-    energy = np.add.reduce(np.multiply(flat, flat, out=memory), axis=1)
-    squares = np.full((channels, count), 1e-10, np.float32)
-    for offset in offsets:
-        squares += energy[:, offset : offset + count]
-    scales = 1 / np.sqrt(squares)
-    flat_blocks, row = blocks.reshape(channels, -1, rows * columns), np.empty(width, np.float32)
-    normalize_blocks(flat, scales, np.array(offsets, np.uintp), height, columns, row, flat_blocks)
+    energy = workspace.take((rows * columns,), np.float32, "energy")
+    memory = np.empty((2, max(0, width)), np.float32)
+    flat, flat_blocks = (each.reshape(channels, -1, rows * columns) for each in (cells, blocks))
+    normalize_blocks(flat, np.array(offsets, np.uintp), height, columns, energy, *memory, flat_blocks)
     return blocks
 
 
 @jit
-def normalize_blocks(cells, scales, offsets, height, columns, squares, blocks):
+def normalize_blocks(cells, offsets, height, columns, energy, scales, squares, blocks):
     """Scale, clip and scale again `height` rows of blocks; see `hog_blocks`.
 
-    `cells` is ``(channels, orient, n)``, with the rows of cells one after the other, `scales`
-    ``(channels, n)`` the factor of the block that starts at each cell, `offsets` the distances of a block's
-    cells from its first one, and `blocks` the output ``(channels, cells of a block * orient, n)``. `squares`
-    is memory for a row of blocks.
+    `cells` is ``(channels, orient, n)``, with the rows of cells one after the other, `offsets` the distances
+    of a block's cells from its first one, and `blocks` the output ``(channels, cells of a block * orient,
+    n)``. The other arrays are memory: `energy` for all cells, `scales` and `squares` for a row of blocks.
     """
-    one, eps, clip = np.float32(1), np.float32(1e-10), np.float32(0.2)
+    zero, one, eps, clip = np.float32(0), np.float32(1), np.float32(1e-10), np.float32(0.2)
     orient, width = cells.shape[1], np.uintp(len(squares))
     for channel in range(cells.shape[0]):
-        factors = scales[channel]
+        energy[:] = zero
+        for k in range(orient):
+            values = cells[channel, k]
+            for i in range(len(energy)):
+                energy[i] += values[i] * values[i]
         for y in range(height):
             start = np.uintp(y * columns)
+            scales[:] = eps
+            for offset in offsets:
+                for x in range(width):
+                    scales[x] += energy[start + offset + x]
+            for x in range(width):
+                scales[x] = one / np.sqrt(scales[x])
             squares[:] = eps
             for index in range(blocks.shape[1]):
                 values, out = cells[channel, index % orient], blocks[channel, index]
                 at = start + offsets[index // orient]
                 for x in range(width):
-                    value = values[at + x] * factors[start + x]
+                    value = values[at + x] * scales[x]
                     value = value if value < clip else clip
                     out[start + x] = value
                     squares[x] += value * value
@@ -373,15 +384,41 @@ def add_root_histograms(
     ``(templates, cell rows - window + 1, cell columns - window + 1)``.
     """
     counts = count_bins(image, weights.shape[2], cell)
-    spans = [2**power for power in range(window.bit_length() - 1)]
-    for span in spans:  # of two rows of cells, of four and so on
-        counts = counts[:-span] + counts[span:]
-    for span in spans:
-        counts = counts[..., :-span] + counts[..., span:]
+    roots = np.empty((counts.shape[1], *scores.shape[1:]), np.float32)
+    root_windows(counts, window, np.empty((3, counts.shape[2]), np.uint16), roots)
     # A window of one cell: its bins are the channels.
-    roots = np.sqrt(counts.transpose(1, 0, 2), order="C", dtype=np.float32)
     for each, out in zip(weights.reshape(len(weights), 1, 1, -1), scores):
         add_correlation(roots, each, 1, out)
+
+
+@jit
+def root_windows(counts, window, memory, roots):
+    """Compute the square roots of the counts of windows; see `add_root_histograms`.
+
+    `counts` is ``(cell rows, bins, cell columns)``, and `roots` the output ``(bins, rows, columns)`` for each
+    cell at which a window starts. `memory` holds three rows of cells.
+    """
+    column_sums, columns, width = memory[0], memory.shape[1], roots.shape[2]
+    for k in range(counts.shape[1]):
+        column_sums[:] = 0
+        for y in range(counts.shape[0]):
+            entering = counts[y, k]
+            for x in range(columns):
+                column_sums[x] += entering[x]
+            first = y - window + 1
+            if first < 0:
+                continue
+            sums, span, turn = column_sums, 1, 1
+            while span < window:  # sums of two columns of cells, of four and so on
+                source, sums, ahead = sums, memory[turn], np.uintp(span)
+                for x in range(np.uintp(columns - span)):
+                    sums[x] = source[x] + source[x + ahead]
+                span, turn = 2 * span, 3 - turn
+            leaving, out = counts[first, k], roots[k, first]
+            for x in range(width):
+                out[x] = np.sqrt(np.float32(sums[x]))
+            for x in range(columns):
+                column_sums[x] -= leaving[x]
 
 
 def add_correlation(
