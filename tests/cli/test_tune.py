@@ -119,7 +119,6 @@ def test_tune_refuses_bad_input(patches, material, tmp_path, monkeypatch):
         Path(name).write_text("a,b\n1,2\n")
     cases = {
         "{patches} -o t.csv --grid color=LAB": "--grid has the unknown option 'color'",
-        "{patches} -o t.csv --grid orient": "--grid must look like 'orient=8,9",
         "{patches} {grid} -o t.csv --model highway": "--model needs a --grid of a search",
         "{grid} -o t.csv": "--grid of features needs patches to train on; give --vehicles and",
         "--grid 'scale=1 overlap=0.5' -o t.csv {frames}": "--grid of a search must be one of 'scales', 'ov",

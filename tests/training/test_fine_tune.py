@@ -12,7 +12,14 @@ from vehicle_detection.errors import InvalidInputError, ModelFileError  # noqa: 
 from vehicle_detection.evaluation import LabelledFrames  # noqa: E402
 from vehicle_detection.network import load_network  # noqa: E402
 from vehicle_detection.tables import TrackTable  # noqa: E402
-from vehicle_detection.training import FrameDataset, detect_logits, fine_tune, fine_tune_network, fingerprint  # noqa: E402
+from vehicle_detection.training import (  # noqa: E402
+    FoldDetections,
+    FrameDataset,
+    detect_logits,
+    fine_tune,
+    fine_tune_network,
+    fingerprint,
+)
 from vehicle_detection.training.fine_tune import hold_out  # noqa: E402
 
 SOURCES = [FrameDataset("road", (drawn(range(5)),)), FrameDataset("coast", (drawn(range(5, 8), "coast"),))]
@@ -73,6 +80,21 @@ def test_many_held_out_vehicles_set_calibration_and_threshold(initial, monkeypat
         monkeypatch.setattr(fine_tune, "fit_log_odds", lambda folds, slope=slope: (slope, 0.5))
         tuned = fine_tune._calibrate(model, folds)
         assert (tuned.slope, tuned.offset, tuned.threshold) == (expected or (1.0, 0.0, -9.0))
+
+
+@pytest.mark.parametrize("right", [(1.0, 0.0, 0.0), (0.0, 0.0, 0.0)])
+def test_many_held_out_vehicles_choose_the_margins(initial, monkeypatch, right):
+    model = dataclasses.replace(load_network(initial), margins=(1.0, 0.0, 0.0))
+
+    def detect(model, sources, jobs):
+        boxes = numbered(60).labels.boxes + 2.0 * (model.margins != right)
+        found = TrackTable(range(60), None, boxes, score=np.ones(60))
+        return [FoldDetections("road", numbered(60), found)]
+
+    monkeypatch.setattr(fine_tune, "detect_logits", detect)
+    assert fine_tune._choose_margins(model, SOURCES, 1)[0].margins == right
+    monkeypatch.setattr(fine_tune, "_MIN_VEHICLES", 61)
+    assert fine_tune._choose_margins(model, SOURCES, 1)[0].margins == model.margins
 
 
 def test_one_frame_is_trained_on_and_not_evaluated(initial):

@@ -73,16 +73,6 @@ def test_the_transformer_passes_the_estimator_checks_that_apply():
     assert len(passed) >= 20
 
 
-def test_the_transformer_depends_on_each_patch_alone():
-    transformer = PatchFeatures(jobs=1)
-    expected = transformer.fit_transform(PATCHES)
-    order = np.random.default_rng(0).permutation(len(PATCHES))
-    np.testing.assert_array_equal(transformer.transform(PATCHES[order]), expected[order])
-    for row in range(len(PATCHES)):
-        np.testing.assert_array_equal(transformer.transform(PATCHES[row : row + 1])[0], expected[row])
-    np.testing.assert_array_equal(transformer.fit(PATCHES[:2]).fit(PATCHES).transform(PATCHES), expected)
-
-
 def test_the_transformer_leaves_its_input_alone_and_can_be_pickled():
     before = PATCHES.copy()
     frozen = np.asfortranarray(PATCHES)

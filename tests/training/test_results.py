@@ -58,14 +58,6 @@ def test_files_of_others_are_kept(text, tmp_path):
     assert path.read_text() == text
 
 
-def test_a_first_line_that_was_interrupted_is_written_again(tmp_path):
-    path, other = tmp_path / "a.jsonl", tmp_path / "b.jsonl"
-    RowStore(other, COLUMNS).add(example_row(0))
-    path.write_bytes(other.read_bytes()[:7])
-    RowStore(path, COLUMNS).add(example_row(0))
-    assert path.read_bytes() == other.read_bytes()
-
-
 def test_damaged_files(tmp_path):
     path = tmp_path / "rows.jsonl"
     RowStore(path, COLUMNS).add(example_row(0))

@@ -17,7 +17,7 @@ import numpy as np
 
 from vehicle_detection._common import check, pluralize
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import LabelledFrames
+from vehicle_detection.evaluation import LabelledFrames, mean
 from vehicle_detection.network import NetworkModel, load_network
 from vehicle_detection.tables import FrameKey
 from vehicle_detection.training.export import export_network, set_metadata
@@ -72,7 +72,8 @@ def fine_tune_network(
 
     Every set of frames is cut into ten blocks of neighboring frames. Two of them are not trained on: the
     network is evaluated on these, before and after. If they show at least 50 vehicles, calibration and
-    threshold are fitted to them, too.
+    threshold are fitted to them, too, and the margins of the initial network are left out if boxes fit better
+    without.
 
     Parameters
     ----------
@@ -120,7 +121,7 @@ def fine_tune_network(
         frames, training, initial=network, device=place, jobs=jobs, checkpoint=path, on_step=on_step
     )
     tuned = load_content(export_network(trained, frames, file_params(model), {}))
-    folds = detect_logits(tuned, held_out, jobs=jobs)
+    tuned, folds = _choose_margins(tuned, held_out, jobs)
     tuned = _calibrate(tuned, folds)
     after = [score_logits(fold, tuned) for fold in folds]
     metadata = _metadata(checked, held_out, training, place, (before, after))
@@ -128,6 +129,21 @@ def fine_tune_network(
     if path is not None:
         path.unlink(missing_ok=True)
     return FineTuning(load_content(content), before, after, folds)
+
+
+def _choose_margins(
+    model: NetworkModel, held_out: Sequence[FrameDataset], jobs: int | None
+) -> tuple[NetworkModel, list[FoldDetections]]:
+    """Leave out the margins of the initial network if boxes fit enough held-out vehicles better without.
+
+    Returns the network and what it detects in the held-out frames.
+    """
+    plain = dataclasses.replace(model, margins=(0.0, 0.0, 0.0))
+    choices = [model, plain] if any(model.margins) else [model]
+    found = [(each, detect_logits(each, held_out, jobs=jobs)) for each in choices]
+    if sum(len(fold.matches.usable) for fold in found[0][1]) < _MIN_VEHICLES:
+        return found[0]
+    return max(found, key=lambda pair: mean([iou for fold in pair[1] for iou in fold.matched_iou]))
 
 
 def _calibrate(model: NetworkModel, folds: Sequence[FoldDetections]) -> NetworkModel:

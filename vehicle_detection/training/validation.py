@@ -124,6 +124,11 @@ class FoldDetections:
         scored = ~self.matches.ignored
         return self.logits[scored], self.matches.match[scored] >= 0
 
+    @property
+    def matched_iou(self) -> Floats:
+        """IoU of each matched prediction with its label."""
+        return self.matches.iou[self.matches.match >= 0]
+
     def above(self, threshold: float) -> TrackTable:
         """Predictions with log-odds of at least `threshold`."""
         return self.predictions[self.logits >= threshold]
