@@ -93,7 +93,7 @@ def test_many_held_out_vehicles_choose_the_margins(initial, monkeypatch, right):
 
     monkeypatch.setattr(fine_tune, "detect_logits", detect)
     assert fine_tune._choose_margins(model, SOURCES, 1)[0].margins == right
-    monkeypatch.setattr(fine_tune, "_MIN_VEHICLES", 61)
+    monkeypatch.setattr(fine_tune, "_MIN_FOR_MARGINS", 61)
     assert fine_tune._choose_margins(model, SOURCES, 1)[0].margins == model.margins
 
 

@@ -35,8 +35,9 @@ from vehicle_detection.training.weights import read_weights
 
 # Each set is cut into so many blocks of neighboring frames; every fifth is held out.
 _BLOCKS, _EVERY, _HELD = 10, 5, 2
-# Vehicles in the held-out frames from which on they set calibration and threshold.
-_MIN_VEHICLES = 50
+# Vehicles in the held-out frames from which on they set calibration and threshold; and the margins, for which
+# the same boxes are compared.
+_MIN_VEHICLES, _MIN_FOR_MARGINS = 50, 20
 # Slope of a calibration above which scores separate right and false boxes: it has no best value.
 _MAX_SLOPE = 10.0
 # Longer side (px) to which frames are reduced in memory: about twice that of the samples.
@@ -72,8 +73,8 @@ def fine_tune_network(
 
     Every set of frames is cut into ten blocks of neighboring frames. Two of them are not trained on: the
     network is evaluated on these, before and after. If they show at least 50 vehicles, calibration and
-    threshold are fitted to them, too, and the margins of the initial network are left out if boxes fit better
-    without.
+    threshold are fitted to them, too; from 20 on, the margins of the initial network are left out if boxes
+    fit better without.
 
     Parameters
     ----------
@@ -141,7 +142,7 @@ def _choose_margins(
     plain = dataclasses.replace(model, margins=(0.0, 0.0, 0.0))
     choices = [model, plain] if any(model.margins) else [model]
     found = [(each, detect_logits(each, held_out, jobs=jobs)) for each in choices]
-    if sum(len(fold.matches.usable) for fold in found[0][1]) < _MIN_VEHICLES:
+    if sum(len(fold.matches.usable) for fold in found[0][1]) < _MIN_FOR_MARGINS:
         return found[0]
     return max(found, key=lambda pair: mean([iou for fold in pair[1] for iou in fold.matched_iou]))
 
