@@ -68,6 +68,13 @@ def test_identities_carry_over_from_segment_to_segment(clip, detector, tmp_path)
     assert boxes(track(sorted(card.iterdir()), detector)) == expected
 
 
+def test_a_frame_rate_with_false_cuts_gives_a_warning(detector, caplog):
+    for fps in (5, 4):
+        next(track(open_source("test_images", fps=fps), detector))
+    (message,) = caplog.messages
+    assert " has 4 frames/s: " in message
+
+
 @pytest.mark.parametrize("end", ["close", "delete", "break", "error", "unused"])
 def test_closing_it_early_leaves_no_process(clip, detector, end):
     results = track(clip, detector, frames=True)
