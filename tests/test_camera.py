@@ -222,7 +222,6 @@ def test_a_camera_of_another_size_rectifies_as_one_of_this_size(lens):
     [
         ({"fov": 120}, "choose a fisheye lens"),
         ({"height_m": 0.13}, "height of 0.13 m is unusual"),
-        ({"height_m": 13}, "height of 13 m is unusual"),
         ({"fov": 110, "height_m": 3.2}, ""),
     ],
 )
@@ -230,6 +229,11 @@ def test_unusual_cameras_give_a_warning(stated, warning, caplog):
     open_camera(**stated)
     assert warning in caplog.text
     assert bool(caplog.text) == bool(warning)
+
+
+def test_the_error_of_a_height_that_is_not_stated_covers_vans_and_trucks():
+    for known, std in (({}, 0.1), ({"fov": 90}, 0.2), ({"fov": 90, "height_m": 2}, 0.05)):
+        assert open_camera(**known).height_std_m == std
 
 
 MATRIX = np.array([[1000.0, 0, 645], [0, 1004, 355], [0, 0, 1]])

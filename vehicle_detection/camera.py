@@ -50,8 +50,8 @@ _REFERENCE_SHAPE, _REFERENCE_FOCAL_PX = (720, 1280), 0.9 * 1280
 _LENS_STD, _GIVEN_LENS_STD, _CALIBRATED_LENS_STD, _UNKNOWN_LENS_STD = 0.08, 0.03, 0.01, 0.25
 # Fractions of the frame by which the middle of a lens may differ, and of a radius that is no distortion.
 _MAX_SHIFT, _NEGLIGIBLE = 0.05, 0.003
-# Standard error of a given height of the camera (m).
-_GIVEN_HEIGHT_STD = 0.05
+# Standard errors of a given height of the camera, and of a guess, as cars, vans and trucks have cameras (m).
+_GIVEN_HEIGHT_STD, _UNKNOWN_HEIGHT_STD = 0.05, 0.2
 # Horizon of an unknown camera, its standard error, that of a given horizon, and the largest one of a horizon
 # that counts as known; fractions of the frame's height. The first is that of a level camera.
 _HORIZON, _HORIZON_STD, _GIVEN_HORIZON_STD, _KNOWN_HORIZON_STD = 0.5, 0.06, 0.004, 0.02
@@ -222,6 +222,8 @@ class Camera(fields.Checked):
             known = {"lens": lens}
         elif fov is not None:
             known = {"fov": fov, "focal_std": _GIVEN_LENS_STD}
+        if fov is not None or lens is not None:  # else the error of the lens covers that of the height
+            known["height_std_m"] = _UNKNOWN_HEIGHT_STD
         if height_m is not None:
             height = check.number(height_m, "height_m", above=0, high=100)
             known |= {"height_m": height, "height_std_m": _GIVEN_HEIGHT_STD}
@@ -430,7 +432,7 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
     Any other file is an object with attributes of `Camera`, all of them optional. Instead of ``focal_px`` it
     may hold ``fov`` (degrees along the longer side) or ``lens`` (as in `Camera.for_frame`), and instead of
     ``horizon_px`` ``horizon`` (a fraction of the height). With pixels it needs ``image_size``, ``[width,
-    height]``. A lens or horizon that it lacks gets a large standard error.
+    height]``. A lens, height or horizon that it lacks gets a large standard error.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "camera.json"
@@ -465,6 +467,8 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
             values = {"horizon": _HORIZON, "horizon_std_px": _HORIZON_STD * shape[0]} | values
         if "focal_px" not in values and "lens" not in values:
             values = {"focal_std": _GIVEN_LENS_STD if "fov" in values else _UNKNOWN_LENS_STD} | values
+        if "height_m" not in values and values.keys() & {"fov", "lens", "focal_px"}:
+            values = {"height_std_m": _UNKNOWN_HEIGHT_STD} | values
         # A `focal_px` without `focal_std` keeps the default error: the file does not say how it was measured.
         derived = {name: values.pop(name) for name in _PIXEL_FIELDS[:2] if name in values}
         camera = Camera.for_frame(shape, **values)
@@ -544,7 +548,8 @@ def _from_calibration(path: Path, values: dict[str, Any]) -> Camera:
             )
         lens = {"fisheye": True, "k1": float(k1), "k2": float(k2)}
     camera = Camera.dashcam().for_shape((height, width))
-    return dataclasses.replace(camera, focal_px=float(focal), focal_std=_CALIBRATED_LENS_STD, **lens)
+    lens |= {"focal_px": float(focal), "focal_std": _CALIBRATED_LENS_STD}
+    return dataclasses.replace(camera, height_std_m=_UNKNOWN_HEIGHT_STD, **lens)
 
 
 def _distorted_radii(angles: Floats, distortion: Floats, *, fisheye: bool) -> Floats:

@@ -33,7 +33,6 @@ def test_csv_and_json_hold_the_same(tmp_path):
 def test_other_objects_are_refused(tmp_path):
     with pytest.raises(InvalidInputError, match="events must be an Event, got 1; pass what find_events"):
         write_events([1], tmp_path / "events.csv")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_clips_show_the_frames_around_each_event(tmp_path):

@@ -57,7 +57,6 @@ def test_a_box_without_a_vehicle_is_explained_too(detector):
     assert not explanation.found
     assert explanation.score is None
     assert explanation.margin < 0
-    assert explanation.box.tolist() == [60, 230, 130, 290]
     assert str(explanation).startswith("not found: margin -")
     assert explanation.describe().startswith("No vehicle is found here")
 
