@@ -5,10 +5,9 @@ from vehicle_detection import TrackTable, count_vehicles
 from vehicle_detection.drive import Event
 
 
-def event(kind, frame, number=1):
-    return Event(
-        kind=kind, track_id=number, frame=frame, start_frame=frame, end_frame=frame, time_s=frame / 2
-    )
+def event(kind, frame):
+    frames = dict.fromkeys(("frame", "start_frame", "end_frame"), frame)
+    return Event(kind=kind, track_id=1, time_s=frame / 2, **frames)
 
 
 def test_counts_are_the_sums_of_their_minutes():

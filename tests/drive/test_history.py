@@ -65,8 +65,7 @@ def test_an_outlier_is_not_the_closest_approach():
     distances[3] = 1.0
     approach = history(range(100), distances).closest_approach(25.0)
     assert approach.distance_m == pytest.approx(20.5, abs=0.2)
-    assert approach.frame > 90
-    assert approach.std_m == 1.0
+    assert (approach.frame > 90, approach.std_m) == (True, 1.0)
 
 
 def test_speeds_in_frames_that_are_not_evenly_spaced():

@@ -729,8 +729,6 @@ class TestPrediction:
         assert (tentative.id, tentative.state, tentative.shown) == (0, "tentative", False)
         self.drive(tracker, 75)
         assert tracker.predict(time=30.0) == ()  # beyond the right edge of the frame
-        tracker.end_tracks()
-        assert tracker.predict() == ()
 
     def test_the_time_of_the_last_frame_returns_its_tracks(self):
         tracker = Tracker()
