@@ -340,9 +340,9 @@ def _rescale(cov: Floats, before: Floats, mean: Floats) -> Floats:
     and Hammel, "Utilization of modified polar coordinates for bearings-only tracking", *IEEE Transactions on
     Automatic Control*, 1983).
     """
-    (distance, speed), (new_distance, new_speed) = before.T[:2], mean.T[:2]
-    ratio = np.maximum(new_distance, _MIN_DISTANCE) / distance
-    shear = (new_speed - ratio * speed) / distance
+    distance, new_distance = (np.maximum(each[:, DISTANCE], _MIN_DISTANCE) for each in (before, mean))
+    ratio = new_distance / distance
+    shear = (mean[:, SPEED] - ratio * before[:, SPEED]) / distance
     for rows in (cov, cov.transpose(0, 2, 1)):
         rows[:, SPEED] = ratio[:, None] * rows[:, SPEED] + shear[:, None] * rows[:, DISTANCE]
         rows[:, DISTANCE] *= ratio[:, None]
