@@ -381,8 +381,11 @@ def open_camera(
     """
     named = camera is None or (isinstance(camera, str) and camera in LENSES)
     if isinstance(fov, (int, float)) and _MAX_PINHOLE_FOV <= fov <= 170:
-        advice = "choose a fisheye lens, or distances may be a third too short"
-        _LOGGER.warning("a lens of %g degrees distorts, or that is its diagonal; %s", fov, advice)
+        _LOGGER.warning(
+            "distances may be a third too short with a field of view of %g degrees: such lenses distort, and "
+            "makers state the diagonal; choose a fisheye lens, or state the angle along the longer side",
+            fov,
+        )
     if isinstance(height_m, (int, float)) and (0 < height_m < _HEIGHTS[0] or _HEIGHTS[1] < height_m <= 100):
         _LOGGER.warning("a camera height of %g m is unusual; distances are proportional to it", height_m)
     for name, value, allowed in (

@@ -35,8 +35,8 @@ from vehicle_detection.training.weights import read_weights
 
 # Each set is cut into so many blocks of neighboring frames; every fifth is held out.
 _BLOCKS, _EVERY, _HELD = 10, 5, 2
-# Vehicles in the held-out frames from which on they set calibration and threshold; and the margins, for which
-# the same boxes are compared.
+# Vehicles in the held-out frames from which on they set calibration and threshold, and from which on they
+# choose the margins: fewer, because both choices have boxes of the same vehicles.
 _MIN_VEHICLES, _MIN_FOR_MARGINS = 50, 20
 # Slope of a calibration above which scores separate right and false boxes: it has no best value.
 _MAX_SLOPE = 10.0

@@ -58,7 +58,7 @@ _LOGGER = logging.getLogger(__name__)
 
 # Seconds between log lines on the progress.
 _LOG_INTERVAL = 60.0
-# Frames per second below which fast drives have false cuts.
+# Frames per second below which fast drives have false scene cuts.
 _MIN_FPS = 5
 # Maximum size of the frames that are decoded ahead of the search, unless each worker has only one.
 _LOOKAHEAD_BYTES = 256 << 20
@@ -400,8 +400,8 @@ class TrackRun(Closing):
         self._on_end.callback(self._results.close)
         self.detector.reset(fps=float(self.info.fps))
         if self.info.fps < _MIN_FPS:
-            text = "%s has %g frames/s: fast drives have false cuts, after which vehicles count anew"
-            _LOGGER.warning(text, self.source.name, self.info.fps)
+            text = "%s has %g frames/s: below %d, fast drives have false scene cuts, and vehicles count twice"
+            _LOGGER.warning(text, self.source.name, self.info.fps, _MIN_FPS)
         _LATEST_RUNS[id(self.detector)] = self
         self._started = self._logged = time.perf_counter()
         self._cpu_started = _processor_times()

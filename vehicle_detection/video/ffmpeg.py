@@ -187,14 +187,14 @@ class _Starter:
         """Start a process, which is killed when Python ends in whatever way."""
         started: list[Future[subprocess.Popen[bytes]]] = []
 
-        def start() -> None:
+        def submit_and_wait() -> None:
             with self._lock:
                 self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="ffmpeg-starter")
                 started.append(self._pool.submit(self._start, command, options))
             wait(started)
 
         try:
-            call_in_thread(start)
+            call_in_thread(submit_and_wait)
             return started[0].result()
         except BaseException:  # also KeyboardInterrupt: nobody else knows the process
             for future in started:

@@ -35,6 +35,7 @@ class ClosableQueue(Generic[Item]):
         self._spaces.get()
         if self._aborted:
             self._spaces.put(None)  # for the next call
+            self._items.put(None)  # `replace` may have dropped the one of `abort`
             raise self._error or QueueClosed
         self._items.put(item)
 
